@@ -1,0 +1,87 @@
+"""Shape vocabulary, gradient-safe elementary functions, and frames from normals.
+
+Shapes are written batch first: `*batch` is any number of leading axes. Inside kernels the batch is one trailing axis, "lanes".
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+
+def as_float(name: str, value: ArrayLike, event: tuple[int | str, ...]) -> jax.Array:
+    """An array in JAX's floating precision whose trailing axes are `event`.
+
+    Args:
+        name: the argument's name, for the error.
+        value: what the caller gave.
+        event: wanted trailing shape; a string stands for any size.
+
+    Raises:
+        ValueError: not real numbers, or another trailing shape.
+    """
+    array = jnp.asarray(value)
+    if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == object:
+        raise ValueError(f"{name}: got dtype {array.dtype}, wanted real numbers")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(jnp.result_type(float))
+    got = array.shape[len(array.shape) - len(event) :] if array.ndim >= len(event) else None
+    if got is None or any(isinstance(want, int) and want != have for want, have in zip(event, got, strict=True)):
+        wanted = ", ".join(["*batch", *map(str, event)])
+        raise ValueError(f"{name}: got shape {array.shape}, wanted ({wanted})")
+    return array
+
+
+def broadcast_batch(**batches: tuple[int, ...]) -> tuple[int, ...]:
+    """The common batch shape of several arguments.
+
+    Raises:
+        ValueError: shapes that do not broadcast, with the name of each argument.
+    """
+    try:
+        return jnp.broadcast_shapes(*batches.values())
+    except ValueError:
+        listed = ", ".join(f"{name} {shape}" for name, shape in batches.items())
+        raise ValueError(f"batch shapes do not broadcast: got {listed}; wanted leading axes that agree or are 1") from None
+
+
+def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+    """Quotient, and 0 (with gradient 0) where the denominator is 0."""
+    positive = denominator != 0
+    # Double where: the gradient of the branch not taken would be NaN.
+    return jnp.where(positive, numerator / jnp.where(positive, denominator, 1), 0)
+
+
+def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
+    """Euclidean norm whose gradient at 0 is 0."""
+    squares = jnp.sum(x * x, axis)
+    positive = squares > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
+
+
+def frames_from_normals(normals: jax.Array) -> jax.Array:
+    """Contact frames (t1, t2, n) of unit normals: the x and y axes turned by the smallest rotation that takes z to n.
+
+    The rule is smooth but at n = -z, where it is the half turn about y. Margins of coarse friction pyramids depend on the
+    tangents, so give frames of your own where these matter.
+
+    Args:
+        normals: (*batch, 3), any positive length.
+
+    Returns:
+        (*batch, 3, 3), columns t1, t2, n; NaN for a normal that is zero or not finite.
+    """
+    largest = jnp.max(jnp.abs(normals), -1, keepdims=True)
+    usable = (largest > 0) & jnp.isfinite(largest)
+    # Dividing by the largest entry first keeps tiny and huge normals from under- and overflowing.
+    scaled = normals / jnp.where(usable, largest, 1)
+    n = jnp.where(usable, scaled / jnp.where(usable, safe_norm(scaled)[..., None], 1), jnp.nan)
+    x, y, z = n[..., 0], n[..., 1], n[..., 2]
+    # 1 / (1 + z), without cancellation where z is near -1.
+    upper = z >= 0
+    level = x * x + y * y
+    inverse = jnp.where(upper, 1 / jnp.where(upper, 1 + z, 1), safe_divide(1 - z, jnp.where(upper, 1, level)))
+    down = (~upper) & (level == 0)
+    t1 = jnp.stack([jnp.where(down, -1, 1 - x * x * inverse), -x * y * inverse, -x], -1)
+    t2 = jnp.stack([-x * y * inverse, 1 - y * y * inverse, -y], -1)
+    frames = jnp.stack([t1, t2, n], -1)
+    return jnp.where(jnp.isfinite(n)[..., None, :].all(-1, keepdims=True), frames, jnp.nan)

@@ -1,0 +1,7 @@
+"""What touches what: contacts, friction, the grasp map and compliance."""
+
+from jaxgrasp.contact.compliance import Compliance
+from jaxgrasp.contact.contacts import Contacts
+from jaxgrasp.contact.grasp_map import grasp_map, required_wrench
+
+__all__ = ["Compliance", "Contacts", "grasp_map", "required_wrench"]

@@ -1,0 +1,127 @@
+"""Contacts: where the fingers touch, with which friction and strength."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Contacts:
+    """A batch of grasps by their hard-finger contacts, in the object frame about the centre of mass.
+
+    Every leaf has the full batch shape, so that ``jax.vmap(f)(contacts)`` works. Make one with `from_normals` or `from_frames`.
+    """
+
+    positions: Float[Array, "*batch contacts 3"]
+    """Contact points, m."""
+    frames: Float[Array, "*batch contacts 3 3"]
+    """Contact frames, columns t1, t2, n; n is the object's outward normal, so a finger that pushes has f_n <= 0."""
+    friction: Float[Array, "*batch contacts"]
+    """Coulomb's friction coefficient."""
+    max_force: Float[Array, "*batch contacts"]
+    """Largest normal force, N; bounds the normal component (8), not the norm."""
+    active: Bool[Array, "*batch contacts"]
+    """False where a contact is absent: it counts as if it had never been there, whatever its other data."""
+
+    @classmethod
+    def from_frames(
+        cls,
+        positions: ArrayLike,
+        frames: ArrayLike,
+        *,
+        friction: ArrayLike,
+        max_force: ArrayLike,
+        active: ArrayLike | None = None,
+    ) -> "Contacts":
+        """Contacts whose tangents are given.
+
+        Args:
+            positions: (*batch, n_c, 3), m, object frame, about the centre of mass.
+            frames: (*batch, n_c, 3, 3), rotations with columns t1, t2, n (outward).
+            friction: scalar or (*batch, n_c), >= 0.
+            max_force: scalar or (*batch, n_c), N, finite and positive.
+            active: bool (*batch, n_c); None means that every contact is there.
+
+        Raises:
+            ValueError: shapes that do not fit. Data that are not admissible are not errors here: the grasp that has them is
+                answered with `Status.INVALID_INPUT`.
+        """
+        positions = as_float("positions", positions, ("n_c", 3))
+        frames = as_float("frames", frames, ("n_c", 3, 3))
+        friction = as_float("friction", friction, ())
+        max_force = as_float("max_force", max_force, ())
+        present = jnp.asarray(True if active is None else active)
+        if present.dtype != bool:
+            raise ValueError(f"active: got dtype {present.dtype}, wanted bool")
+        n_c = positions.shape[-2]
+        if n_c == 0 or frames.shape[-3] != n_c:
+            raise ValueError(
+                f"frames: got shape {frames.shape}, wanted (*batch, n_c, 3, 3) with the n_c >= 1 of positions {positions.shape}"
+            )
+        for name, value in (("friction", friction), ("max_force", max_force), ("active", present)):
+            if value.ndim and value.shape[-1] != n_c:
+                raise ValueError(f"{name}: got shape {value.shape}, wanted a scalar or (*batch, {n_c}), one for each contact")
+        batch = broadcast_batch(
+            positions=positions.shape[:-2],
+            frames=frames.shape[:-3],
+            friction=friction.shape[:-1],
+            max_force=max_force.shape[:-1],
+            active=present.shape[:-1],
+        )
+        dtype = jnp.result_type(positions, frames)
+        return cls(
+            positions=jnp.broadcast_to(positions.astype(dtype), (*batch, n_c, 3)),
+            frames=jnp.broadcast_to(frames.astype(dtype), (*batch, n_c, 3, 3)),
+            friction=jnp.broadcast_to(friction.astype(dtype), (*batch, n_c)),
+            max_force=jnp.broadcast_to(max_force.astype(dtype), (*batch, n_c)),
+            active=jnp.broadcast_to(present, (*batch, n_c)),
+        )
+
+    @classmethod
+    def from_normals(
+        cls,
+        positions: ArrayLike,
+        outward_normals: ArrayLike,
+        *,
+        friction: ArrayLike,
+        max_force: ArrayLike,
+        active: ArrayLike | None = None,
+    ) -> "Contacts":
+        """Contacts whose tangents do not matter: x and y turned by the smallest rotation that takes z to the normal.
+
+        Args:
+            positions: (*batch, n_c, 3), m, object frame, about the centre of mass.
+            outward_normals: (*batch, n_c, 3), pointing out of the object; they are normalised, and a zero normal makes its
+                grasp `Status.INVALID_INPUT`.
+            friction: scalar or (*batch, n_c), >= 0.
+            max_force: scalar or (*batch, n_c), N, finite and positive.
+            active: bool (*batch, n_c); None means that every contact is there.
+
+        Raises:
+            ValueError: shapes that do not fit.
+        """
+        normals = as_float("outward_normals", outward_normals, ("n_c", 3))
+        n_c = as_float("positions", positions, ("n_c", 3)).shape[-2]
+        if normals.shape[-2] != n_c:
+            raise ValueError(
+                f"outward_normals: got shape {normals.shape}, wanted (*batch, {n_c}, 3) like positions {jnp.shape(positions)}"
+            )
+        return cls.from_frames(
+            positions, frames_from_normals(normals), friction=friction, max_force=max_force, active=active
+        )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """The leading axes."""
+        return self.positions.shape[:-2]
+
+    @property
+    def n_c(self) -> int:
+        """Number of contacts, absent ones included."""
+        return self.positions.shape[-2]

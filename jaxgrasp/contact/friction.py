@@ -1,0 +1,27 @@
+"""Coulomb's cone and its inscribed pyramid."""
+
+import math
+
+import numpy as np
+
+
+def pyramid_facets(cone_edges: int) -> np.ndarray:
+    """Facet rows of the friction pyramid for unit friction: row k is (cos, sin, cos(pi / n_e)) at the angle pi (2 k + 1) / n_e.
+
+    The edges stand at angles 2 pi k / n_e from t1, on Coulomb's cone |f_t| <= -mu f_n, so facet k has its normal halfway between two of
+    them. For friction mu the rows of C in C f <= -d (1) are these with the last entry times mu: the pyramid is inscribed, and what
+    holds for it holds for the cone.
+
+    Args:
+        cone_edges: n_e, at least 3.
+
+    Returns:
+        (n_e, 3).
+
+    Raises:
+        ValueError: fewer than three edges.
+    """
+    if int(cone_edges) != cone_edges or cone_edges < 3:
+        raise ValueError(f"cone_edges: got {cone_edges}, wanted an integer of at least 3")
+    angles = math.pi * (2 * np.arange(cone_edges) + 1) / cone_edges
+    return np.stack([np.cos(angles), np.sin(angles), np.full(cone_edges, math.cos(math.pi / cone_edges))], -1)

@@ -1,0 +1,207 @@
+"""The sets that disturbance sets are sums of: each knows its support function.
+
+Inside kernels the lanes trail: directions are (6, rows..., *lanes), the leaves of a term (event..., *lanes) with lanes of size 1
+where shared.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxgrasp.arrays import safe_norm
+
+_CHUNK = 16
+
+
+class Term(Protocol):
+    """A convex set of wrenches that contains the origin."""
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes, for batch-first leaves."""
+        ...
+
+    def spread_over(self, batch: tuple[int, ...]) -> Self:
+        """Leaves broadcast to a batch shape, for batch-first leaves."""
+        ...
+
+    def rotated(self, rotation: jax.Array) -> "Term":
+        """The set turned by rotations (*batch, 3, 3), for batch-first leaves."""
+        ...
+
+    def support(self, directions: jax.Array) -> jax.Array:
+        """max(0, max over the set of a'w) for directions a (6, ..., *lanes)."""
+        ...
+
+    def extent(self) -> jax.Array:
+        """(6, *lanes): the largest |w_i| for every component."""
+        ...
+
+
+def _combine(weights: jax.Array, directions: jax.Array) -> jax.Array:
+    """Sum over six components of weights (6, *lanes) with directions (6, ..., *lanes)."""
+    total = _align(weights[0], directions[0]) * directions[0]
+    for i in range(1, 6):
+        total = total + _align(weights[i], directions[0]) * directions[i]
+    return total
+
+
+def _align(leaf: jax.Array, like: jax.Array) -> jax.Array:
+    """Insert axes before the lanes, so that (*lanes) meets (rows..., *lanes)."""
+    return leaf.reshape((1,) * (like.ndim - leaf.ndim) + leaf.shape) if leaf.ndim else leaf
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Vertices:
+    """The convex hull of wrenches and the origin."""
+
+    wrenches: Float[Array, "*batch directions 6"]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes."""
+        return self.wrenches.shape[:-2]
+
+    def spread_over(self, batch: tuple[int, ...]) -> "Vertices":
+        """Broadcast."""
+        return Vertices(wrenches=jnp.broadcast_to(self.wrenches, (*batch, *self.wrenches.shape[-2:])))
+
+    def rotated(self, rotation: jax.Array) -> "Vertices":
+        """R acts on force and moment alike."""
+        halves = self.wrenches.reshape(*self.wrenches.shape[:-1], 2, 3)
+        turned = jnp.einsum("...ij,...dhj->...dhi", rotation, halves)
+        return Vertices(wrenches=turned.reshape(*turned.shape[:-2], 6))
+
+    def support(self, directions: jax.Array) -> jax.Array:
+        """A running maximum over the vertices, a few at a time: memory does not grow with their number."""
+        count, wrenches = self.wrenches.shape[0], self.wrenches
+
+        def raise_to(best: jax.Array, some: jax.Array) -> jax.Array:
+            for j in range(some.shape[0]):
+                best = jnp.maximum(best, _combine(some[j], directions))
+            return best
+
+        best = jnp.zeros_like(directions[0])
+        if count <= _CHUNK:
+            return raise_to(best, wrenches)
+        chunks = -(-count // _CHUNK)
+        padded = jnp.pad(wrenches, [(0, chunks * _CHUNK - count)] + [(0, 0)] * (wrenches.ndim - 1))
+
+        def body(i: jax.Array, best: jax.Array) -> jax.Array:
+            return raise_to(best, lax.dynamic_slice_in_dim(padded, i * _CHUNK, _CHUNK))
+
+        return lax.fori_loop(0, chunks, body, best)
+
+    def extent(self) -> jax.Array:
+        """Componentwise maximum."""
+        return jnp.max(jnp.abs(self.wrenches), 0, initial=0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """|w_i| <= half_extents_i in a frame whose axes are columns of `axes` (None: the object's)."""
+
+    half_extents: Float[Array, "*batch 6"]
+    axes: Float[Array, "*batch 3 3"] | None
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes."""
+        own = self.half_extents.shape[:-1]
+        return own if self.axes is None else jnp.broadcast_shapes(own, self.axes.shape[:-2])
+
+    def spread_over(self, batch: tuple[int, ...]) -> "Box":
+        """Broadcast."""
+        axes = None if self.axes is None else jnp.broadcast_to(self.axes, (*batch, 3, 3))
+        return Box(half_extents=jnp.broadcast_to(self.half_extents, (*batch, 6)), axes=axes)
+
+    def rotated(self, rotation: jax.Array) -> "Box":
+        """Turn the axes."""
+        return Box(half_extents=self.half_extents, axes=rotation if self.axes is None else rotation @ self.axes)
+
+    def support(self, directions: jax.Array) -> jax.Array:
+        """Sum of |a_i| r_i, a in the box's frame."""
+        if self.axes is not None:
+            columns = [
+                sum(_align(self.axes[r, c], directions[0]) * directions[half + r] for r in range(3))
+                for half in (0, 3)
+                for c in range(3)
+            ]
+            directions = jnp.stack(columns)
+        return _combine(self.half_extents, jnp.abs(directions))
+
+    def extent(self) -> jax.Array:
+        """Half extents, turned."""
+        if self.axes is None:
+            return self.half_extents
+        turned = jnp.abs(self.axes)
+        return jnp.stack([sum(turned[r, c] * self.half_extents[h + c] for c in range(3)) for h in (0, 3) for r in range(3)])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Ellipsoid:
+    """L u with |u| <= 1."""
+
+    shape_matrix: Float[Array, "*batch 6 6"]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes."""
+        return self.shape_matrix.shape[:-2]
+
+    def spread_over(self, batch: tuple[int, ...]) -> "Ellipsoid":
+        """Broadcast."""
+        return Ellipsoid(shape_matrix=jnp.broadcast_to(self.shape_matrix, (*batch, 6, 6)))
+
+    def rotated(self, rotation: jax.Array) -> "Ellipsoid":
+        """R acts on force and moment rows alike."""
+        halves = self.shape_matrix.reshape(*self.batch_shape, 2, 3, 6)
+        turned = jnp.einsum("...ij,...hjk->...hik", rotation, halves)
+        return Ellipsoid(shape_matrix=turned.reshape(*turned.shape[:-3], 6, 6))
+
+    def support(self, directions: jax.Array) -> jax.Array:
+        """|L'a|."""
+        return safe_norm(jnp.stack([_combine(self.shape_matrix[:, c], directions) for c in range(6)]), 0)
+
+    def extent(self) -> jax.Array:
+        """Row norms."""
+        return safe_norm(self.shape_matrix, 1)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Ball:
+    """A ball of forces and, independently, one of moments."""
+
+    force: Float[Array, "*batch"]
+    torque: Float[Array, "*batch"]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes."""
+        return jnp.broadcast_shapes(self.force.shape, self.torque.shape)
+
+    def spread_over(self, batch: tuple[int, ...]) -> "Ball":
+        """Broadcast."""
+        return Ball(force=jnp.broadcast_to(self.force, batch), torque=jnp.broadcast_to(self.torque, batch))
+
+    def rotated(self, rotation: jax.Array) -> "Ball":
+        """A ball stays what it is."""
+        return self
+
+    def support(self, directions: jax.Array) -> jax.Array:
+        """force |a_f| + torque |a_m|."""
+        return _align(self.force, directions[0]) * safe_norm(directions[:3], 0) + _align(
+            self.torque, directions[0]
+        ) * safe_norm(directions[3:], 0)
+
+    def extent(self) -> jax.Array:
+        """Radii."""
+        return jnp.stack([*[self.force] * 3, *[self.torque] * 3])

@@ -1,0 +1,43 @@
+"""Keeping XLA's CPU backend from computing the same thing many times.
+
+XLA's CPU fusion copies a cheap producer into every consumer. In a long chain of small dense algebra that multiplies the work (and
+the compile time) tenfold, and `lax.optimization_barrier` is gone before fusion runs. A call that is marked as not inlineable is
+kept as a function of its own, so its results are computed once.
+"""
+
+import contextlib
+import contextvars
+import functools
+from collections.abc import Callable, Iterator
+from typing import ParamSpec, TypeVar
+
+import jax
+from jax.experimental.xla_metadata import set_xla_metadata
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_fences = contextvars.ContextVar("fences", default=False)
+
+
+@contextlib.contextmanager
+def fences(on: bool) -> Iterator[None]:
+    """Whether `fenced` functions traced inside become functions of their own; worth it on CPUs alone."""
+    token = _fences.set(on)
+    try:
+        yield
+    finally:
+        _fences.reset(token)
+
+
+def fenced(function: Callable[P, T]) -> Callable[P, T]:
+    """Compute the results of `function` exactly once, where fences are on. Arguments must be trees of arrays."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        if not _fences.get():
+            return function(*args, **kwargs)
+        with set_xla_metadata(inlineable="false"):
+            return jax.jit(function)(*args, **kwargs)
+
+    return wrapped

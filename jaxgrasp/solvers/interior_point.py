@@ -1,0 +1,289 @@
+"""The one primal-dual interior-point loop: Mehrotra's predictor-corrector over a batch of lanes.
+
+A problem says what its unknowns are and how to solve its Newton system; the loop owns step lengths, centring, freezing of
+finished lanes and the stopping rule. All arrays carry the batch in their trailing axes ("lanes"), so that one lane is one
+problem and every elementwise operation works on a full vector of problems; with no trailing axis the same code is the
+program of a single problem.
+
+The problems have the form: minimise over x subject to E x = b and A x + s = h, s >= 0, with multipliers y and z >= 0.
+
+Source: Mehrotra (1992), "On the implementation of a primal-dual interior point method"; the step rule and the freezing are
+described in `solve`.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxgrasp.fence import fenced
+
+Tree = Any
+
+
+class Settings(NamedTuple):
+    """Numbers of the loop. All may be traced: changing them costs no recompilation, but for `equal_steps`.
+
+    tolerance: stop at upper - lower <= tolerance * max(1, |lower|).
+    max_iterations: steps at most.
+    step_cap: how close to the boundary a step may end, 1 - step_cap at most when mu is large.
+    mu_floor: smallest complementarity that is aimed at.
+    equal_steps: one step length for primal and dual unknowns (static).
+    safeguard: keep s >= safeguard * mu / z and z >= safeguard * mu / s after a step (static; 0.0 switches it off).
+    """
+
+    tolerance: float
+    max_iterations: int
+    step_cap: float
+    mu_floor: float
+    equal_steps: bool
+    safeguard: float
+
+
+class Iterate(NamedTuple):
+    """Unknowns; every leaf has trailing lane axes. `s` and `z` are trees of rows, alike in structure."""
+
+    x: Tree
+    y: Tree
+    s: Tree
+    z: Tree
+
+
+class Residuals(NamedTuple):
+    """What the optimality conditions lack: `dual` like x, `primal` like y, `rows` = A x + s - h like s."""
+
+    dual: Tree
+    primal: Tree
+    rows: Tree
+
+
+class Problem(Protocol):
+    """What the loop asks of a problem. `lanes` is the shape of the batch."""
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """Shape of the trailing axes."""
+        ...
+
+    @property
+    def present(self) -> Tree:
+        """Like s, broadcastable: 1 where a row counts, 0 where it belongs to something absent."""
+        ...
+
+    def start(self) -> Iterate:
+        """The first iterate, s > 0; z > 0 on rows that count and exactly 0 on the others."""
+        ...
+
+    def residuals(self, iterate: Iterate) -> Residuals:
+        """Residuals of the optimality conditions."""
+        ...
+
+    def factor(self, weights: Tree) -> Any:
+        """Factorisation of the Newton system for weights z/s (like s)."""
+        ...
+
+    def solve(self, factors: Any, weights: Tree, residuals: Residuals, shift: Tree) -> tuple[Tree, Tree, Tree]:
+        """Directions (dx, dy, A dx) of the Newton system whose multiplier rows read dz = shift + weights * A dx."""
+        ...
+
+    def first_record(self) -> Any:
+        """The record before the first step; has `lower` and `upper`, certified bounds per lane."""
+        ...
+
+    def assess(self, iterate: Iterate, residuals: Residuals, record: Any) -> Any:
+        """The record with this iterate taken into account; bounds only ever get better."""
+        ...
+
+
+class Outcome(NamedTuple):
+    """What the loop leaves behind; per lane: steps taken, whether the gap closed, last complementarity mu."""
+
+    iterate: Iterate
+    residuals: Residuals
+    record: Any
+    iterations: jax.Array
+    converged: jax.Array
+    mu: jax.Array
+
+
+class _Carry(NamedTuple):
+    iterate: Iterate
+    residuals: Residuals
+    record: Any
+    best_gap: jax.Array
+    stalled: jax.Array
+    active: jax.Array
+    iterations: jax.Array
+    mu: jax.Array
+    step: jax.Array
+
+
+def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
+    """Run the loop until every active lane is finished.
+
+    Centring is (mu_aff / mu)^3; a step goes to max(0.99, 1 - max(mu, step_cap)) of the way to the boundary. A lane is finished
+    when its certified bounds have met, or when three steps in a row cut their gap by less than a tenth; then it freezes:
+    nothing of it changes any more, whatever its neighbours do. A step that is not finite is not taken.
+
+    Args:
+        problem: what to solve.
+        settings: numbers of the loop.
+        active: bool (*lanes); lanes that are False are not touched.
+    """
+    lanes = len(problem.lanes)
+    present = problem.present
+    count = _reduce(jnp.add, jax.tree.map(lambda p, s: jnp.broadcast_to(p, s.shape), present, problem.start().s), lanes)
+    inverse_count = 1 / jnp.maximum(count, 1)
+    iterate = problem.start()
+    mu = _product(iterate.s, iterate.z, lanes) * inverse_count
+
+    def unfinished(carry: _Carry) -> jax.Array:
+        return (carry.step < settings.max_iterations) & jnp.any(carry.active)
+
+    def body(carry: _Carry) -> _Carry:
+        stepped, mu = _predict_correct(problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count)
+        active = carry.active
+        take = active & jnp.isfinite(mu)
+        iterate = _where(take, stepped, carry.iterate)
+        residuals = fenced(problem.residuals)(iterate)
+        record = _where(active, fenced(problem.assess)(iterate, residuals, carry.record), carry.record)
+        gap = record.upper - record.lower
+        improved = gap < 0.9 * carry.best_gap
+        stalled = jnp.where(improved, 0, carry.stalled + 1)
+        closed = gap <= settings.tolerance * jnp.maximum(1, jnp.abs(record.lower))
+        return _Carry(
+            iterate=iterate,
+            residuals=residuals,
+            record=record,
+            best_gap=jnp.where(improved, gap, carry.best_gap),
+            stalled=stalled,
+            active=active & ~closed & (stalled < 3),
+            iterations=carry.iterations + active,
+            mu=jnp.where(take, mu, carry.mu),
+            step=carry.step + 1,
+        )
+
+    first = _Carry(
+        iterate=iterate,
+        residuals=problem.residuals(iterate),
+        record=problem.first_record(),
+        best_gap=jnp.full_like(mu, jnp.inf),
+        stalled=jnp.zeros(problem.lanes, jnp.int32),
+        active=active,
+        iterations=jnp.zeros(problem.lanes, jnp.int32),
+        mu=mu,
+        step=jnp.zeros((), jnp.int32),
+    )
+    last = lax.while_loop(unfinished, body, first)
+    gap = last.record.upper - last.record.lower
+    return Outcome(
+        iterate=last.iterate,
+        residuals=last.residuals,
+        record=last.record,
+        iterations=last.iterations,
+        converged=gap <= settings.tolerance * jnp.maximum(1, jnp.abs(last.record.lower)),
+        mu=last.mu,
+    )
+
+
+def _predict_correct(
+    problem: Problem, settings: Settings, iterate: Iterate, residuals: Residuals, mu: jax.Array, inverse_count: jax.Array
+) -> tuple[Iterate, jax.Array]:
+    """One step; returns the new iterate and its complementarity, NaN where the step is unusable."""
+    lanes, present = len(problem.lanes), problem.present
+
+    @fenced
+    def weigh(s: Tree, z: Tree, rows: Tree) -> tuple[Tree, ...]:
+        # One division serves weights and both ratio tests; absent rows (z = 0) divide by 1 instead of 0.
+        guarded = jax.tree.map(lambda z, p: z + (1 - p), z, present)
+        inverse = jax.tree.map(lambda s, g: 1 / (s * g), s, guarded)
+        inverse_s = jax.tree.map(jnp.multiply, guarded, inverse)
+        inverse_z = jax.tree.map(jnp.multiply, s, inverse)
+        weights = jax.tree.map(jnp.multiply, z, inverse_s)
+        return inverse_s, inverse_z, weights, jax.tree.map(lambda z, w, r: w * r - z, z, weights, rows)
+
+    inverse_s, inverse_z, weights, affine_shift = weigh(iterate.s, iterate.z, residuals.rows)
+    factors = problem.factor(weights)
+
+    def direction(shift: Tree) -> tuple[Iterate, jax.Array, jax.Array]:
+        dx, dy, rows = problem.solve(factors, weights, residuals, shift)
+        ds, dz, primal, dual = blocking(rows, shift, weights, residuals.rows, inverse_s, inverse_z)
+        return Iterate(dx, dy, ds, dz), primal, dual
+
+    @fenced
+    def blocking(rows: Tree, shift: Tree, weights: Tree, lacking: Tree, inverse_s: Tree, inverse_z: Tree) -> tuple:
+        """ds, dz and the reciprocals of the steps that reach the boundary."""
+        ds = jax.tree.map(lambda r, a: -r - a, lacking, rows)
+        dz = jax.tree.map(lambda e, w, a: e + w * a, shift, weights, rows)
+        primal = _reduce(jnp.maximum, jax.tree.map(lambda d, i: -d * i, ds, inverse_s), lanes)
+        dual = _reduce(jnp.maximum, jax.tree.map(lambda d, i: -d * i, dz, inverse_z), lanes)
+        if settings.equal_steps:
+            primal = dual = jnp.maximum(primal, dual)
+        return ds, dz, primal, dual
+
+    @fenced
+    def correct(iterate: Iterate, affine: Iterate, primal: jax.Array, dual: jax.Array, mu: jax.Array, inverse_s: Tree) -> Tree:
+        """The corrector's shift: aim at sigma mu and make up for the second-order term ds dz."""
+        primal, dual = 1 / jnp.maximum(primal, 1), 1 / jnp.maximum(dual, 1)
+        reached = jax.tree.map(
+            lambda s, z, ds, dz: (s + primal * ds) * (z + dual * dz), iterate.s, iterate.z, affine.s, affine.z
+        )
+        ratio = inverse_count * _reduce(jnp.add, reached, lanes) / mu
+        aim = jnp.maximum(ratio * ratio * ratio * mu, settings.mu_floor)
+        return jax.tree.map(
+            lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, affine.s, affine.z, inverse_s, present
+        )
+
+    @fenced
+    def advance(iterate: Iterate, step: Iterate, primal: jax.Array, dual: jax.Array, mu: jax.Array) -> tuple:
+        eta = jnp.maximum(0.99, 1 - jnp.maximum(mu, settings.step_cap))
+        primal, dual = eta / jnp.maximum(primal, eta), eta / jnp.maximum(dual, eta)
+        new = Iterate(
+            x=_axpy(primal, step.x, iterate.x),
+            y=_axpy(dual, step.y, iterate.y),
+            s=_axpy(primal, step.s, iterate.s),
+            z=_axpy(dual, step.z, iterate.z),
+        )
+        mu_new = _product(new.s, new.z, lanes) * inverse_count
+        if settings.safeguard:
+            low = settings.safeguard * mu_new
+            kept_s = jax.tree.map(lambda s, z, p: jnp.maximum(s, low / (z + (1 - p)) * p), new.s, new.z, present)
+            kept_z = jax.tree.map(lambda s, z, p: jnp.maximum(z, low / s * p), new.s, new.z, present)
+            new = new._replace(s=kept_s, z=kept_z)
+        return new, mu_new
+
+    affine, primal, dual = direction(affine_shift)
+    step, primal, dual = direction(correct(iterate, affine, primal, dual, mu, inverse_s))
+    return advance(iterate, step, primal, dual, mu)
+
+
+def _axpy(step: jax.Array, direction: Tree, point: Tree) -> Tree:
+    return jax.tree.map(lambda d, x: x + step * d, direction, point)
+
+
+def _product(a: Tree, b: Tree, lanes: int) -> jax.Array:
+    return _reduce(jnp.add, jax.tree.map(jnp.multiply, a, b), lanes)
+
+
+def _reduce(op: Any, tree: Tree, lanes: int) -> jax.Array:
+    """Reduce all leaves over everything but the trailing lane axes, unrolled: XLA's CPU code vectorises over lanes."""
+    parts = []
+    for leaf in jax.tree.leaves(tree):
+        part = leaf
+        while part.ndim > lanes:
+            part = fold(op, part)
+        parts.append(part)
+    return fold(op, parts)
+
+
+def fold(op: Any, parts: Any) -> jax.Array:
+    """Combine the entries along the leading axis with a binary operation, pairwise."""
+    parts = list(parts)
+    while len(parts) > 1:
+        parts = [op(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i] for i in range(0, len(parts), 2)]
+    return parts[0]
+
+
+def _where(mask: jax.Array, new: Tree, old: Tree) -> Tree:
+    return jax.tree.map(lambda n, o: jnp.where(mask, n, o), new, old)

@@ -1,0 +1,101 @@
+"""Batches as lanes: any leading axes and any nesting of vmap become one trailing axis, worked through in tiles.
+
+A kernel is a function of arrays whose last axis is the lane; a leaf that all lanes share has a last axis of size 1. On CPUs the lanes are cut into
+tiles that stay in the cache; elsewhere they go at once.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jax.experimental.xla_metadata import set_xla_metadata
+
+from jaxgrasp.fence import fences
+
+Tree = Any
+TILE = 64
+LARGE_TILE = 1 << 17
+
+
+def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree) -> Tree:
+    """Run a kernel over the leading axis of its arguments.
+
+    Args:
+        kernel: takes the tree of arguments with the lane axis last (size 1 where shared), returns a tree of arrays with the lane axis last.
+        arguments: leaves (lanes, ...), or without the leading axis where shared.
+        shared: like arguments, bool: the leaf is the same for all lanes.
+
+    Returns:
+        The kernel's tree, leaves (lanes, ...).
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    return _run(kernel, structure, tuple(jax.tree.leaves(shared)))(leaves)
+
+
+def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...]) -> Callable:
+    @custom_vmap
+    def run(leaves: list[jax.Array]) -> Tree:
+        return _tiled(kernel, structure, shared, leaves)
+
+    @run.def_vmap
+    def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
+        (batched,) = batched
+        lanes = next(x.shape[1 if b else 0] for x, b, s in zip(leaves, batched, shared, strict=True) if not s)
+        merged, still_shared = [], []
+        for leaf, is_batched, is_shared in zip(leaves, batched, shared, strict=True):
+            still_shared.append(is_shared and not is_batched)
+            if is_shared and not is_batched:
+                merged.append(leaf)
+                continue
+            if is_shared:
+                leaf = jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
+            elif not is_batched:
+                leaf = jnp.broadcast_to(leaf[None], (size, *leaf.shape))
+            merged.append(leaf.reshape(size * lanes, *leaf.shape[2:]))
+        out = _run(kernel, structure, tuple(still_shared))(merged)
+        out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return run
+
+
+def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], leaves: list[jax.Array]) -> Tree:
+    lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
+
+    def solve(parts: list[jax.Array]) -> Tree:
+        last = [x[..., None] if s else jnp.moveaxis(x, 0, -1) for x, s in zip(parts, shared, strict=True)]
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), kernel(jax.tree.unflatten(structure, last)))
+
+    def in_tiles(tile: int, one: Callable) -> Tree:
+        count = math.ceil(lanes / tile)
+        own = [x for x, s in zip(leaves, shared, strict=True) if not s]
+        own = [jnp.pad(x, [(0, count * tile - lanes)] + [(0, 0)] * (x.ndim - 1)) for x in own]
+
+        def body(parts: list[jax.Array]) -> Tree:
+            parts = iter(parts)
+            return one([x if s else next(parts) for x, s in zip(leaves, shared, strict=True)])
+
+        if count == 1:
+            out = jax.tree.map(lambda x: x[None], body(own))
+        else:
+            out = lax.map(body, [x.reshape(count, tile, *x.shape[1:]) for x in own])
+        return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
+
+    def on_cpu() -> Tree:
+        tile = jax.jit(solve)
+
+        def one(parts: list[jax.Array]) -> Tree:
+            # XLA's CPU backend then emits the tile as one function, free of the overhead it has for every operation.
+            with fences(True), set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+                return tile(parts)
+
+        return in_tiles(min(TILE, lanes), one)
+
+    def elsewhere() -> Tree:
+        return in_tiles(min(LARGE_TILE, lanes), solve)
+
+    return lax.platform_dependent(cpu=on_cpu, default=elsewhere)
