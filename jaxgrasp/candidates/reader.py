@@ -1,0 +1,167 @@
+"""Files of candidates: which fields there are, what shape each has, and what is wrong with one that cannot be used."""
+
+import difflib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from jaxgrasp.candidates.archive import CandidateError, read_archive
+from jaxgrasp.candidates.candidates import Candidates, concatenate
+
+FIELDS = ("positions", "outward_normals", "frames", "friction", "max_force", "mass", "center_of_mass", "active")
+
+# An unknown column this near to a known field that is absent is a misspelling: 'max_forces' is 0.95 from 'max_force',
+# while 'mask' is 0.75 from 'mass'. A field that is required and missing is sought from further away ('normals').
+_SURELY_MEANT = 0.8
+_PERHAPS_MEANT = 0.55
+
+
+def read_candidates(
+    paths: Sequence[Path | str],
+    *,
+    friction: float | None = None,
+    max_force: float | None = None,
+    with_mass: bool = False,
+) -> Candidates:
+    """Reads candidate grasps from one or more `.npz` files.
+
+    Fields: positions (N, n_c, 3), about the centre of mass, and outward_normals (N, n_c, 3) or frames (N, n_c, 3, 3),
+    columns t1, t2, n; optional friction and max_force, each (), (N,) or (N, n_c), where (N,) is one per candidate;
+    mass () or (N,); active (N, n_c) bool. Other columns with a leading axis of N travel along, with center_of_mass.
+    Data that is not per candidate is passed over.
+
+    Args:
+        paths: The files; they may differ in n_c.
+        friction: Coulomb's coefficient for files without any.
+        max_force: Largest normal force for files without any, N.
+        with_mass: Whether every file must have masses.
+
+    Returns:
+        The candidates of all files, in their order.
+
+    Raises:
+        CandidateError: A file cannot be used, or the files do not go together.
+    """
+    parts = [_read_file(Path(path), friction, max_force, with_mass) for path in paths]
+    try:
+        return concatenate(parts)
+    except ValueError as error:
+        raise CandidateError(
+            ", ".join(str(path) for path in paths), None, str(error), "files that go together"
+        ) from error
+
+
+def _read_file(path: Path, friction: float | None, max_force: float | None, with_mass: bool) -> Candidates:
+    arrays = read_archive(path)
+    _refuse_misspelt(path, arrays)
+    positions = _numbers(path, "positions", _required(path, arrays, "positions"))
+    if positions.ndim != 3 or positions.shape[2] != 3 or positions.shape[1] == 0:
+        raise CandidateError(path, "positions", f"shape {positions.shape}", "(N, n_c, 3)")
+    count, contacts = positions.shape[:2]
+    if count == 0:
+        raise CandidateError(path, "positions", f"no candidates (shape {positions.shape})", "at least one")
+
+    def optional(name: str, shapes: Sequence[tuple[int, ...]]) -> np.ndarray | None:
+        if name not in arrays:
+            return None
+        value = _numbers(path, name, arrays[name])
+        if value.shape not in shapes:
+            raise CandidateError(path, name, f"shape {value.shape}", " or ".join(map(str, shapes)))
+        return value
+
+    def per_contact(name: str, given: float | None) -> np.ndarray:
+        value = optional(name, ((), (count,), (count, contacts)))
+        if value is None and given is None:
+            option = "--" + name.replace("_", "-")
+            _missing(path, arrays, name, f"the column, or one value for all with {name}= ({option})")
+        value = np.asarray(given if value is None else value, dtype=float)
+        return np.broadcast_to(value[:, None] if value.ndim == 1 else value, (count, contacts))
+
+    if "frames" in arrays and "outward_normals" in arrays:
+        raise CandidateError(path, "frames", "outward_normals as well", "one of the two")
+    frames = optional("frames", ((count, contacts, 3, 3),))
+    normals = optional("outward_normals", ((count, contacts, 3),))
+    if frames is None and normals is None:
+        _missing(path, arrays, "outward_normals", "outward_normals (N, n_c, 3) or frames (N, n_c, 3, 3)")
+    mass = optional("mass", ((), (count,)))
+    if mass is None and with_mass:
+        _missing(path, arrays, "mass", "the column, because gravity needs it")
+    return Candidates(
+        positions=positions,
+        outward_normals=normals,
+        frames=frames,
+        friction=per_contact("friction", friction),
+        max_force=per_contact("max_force", max_force),
+        active=_active(path, arrays.get("active"), (count, contacts)),
+        mass=np.broadcast_to(np.nan if mass is None else mass, (count,)),
+        columns=_travelling(path, arrays, count),
+        sources=(str(path),),
+        source=np.zeros(count, dtype=np.int32),
+        index=np.arange(count, dtype=np.int64),
+    )
+
+
+def _required(path: Path, arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
+    if name not in arrays:
+        _missing(path, arrays, name, "the column")
+    return arrays[name]
+
+
+def _missing(path: Path, arrays: dict[str, np.ndarray], name: str, wanted: str) -> NoReturn:
+    unknown = [other for other in arrays if other not in FIELDS]
+    near = _nearest(name, unknown, _PERHAPS_MEANT)
+    there = f"a similar {near!r}" if near else ", ".join(arrays) or "nothing"
+    got = f"no such column (there is {there})"
+    raise CandidateError(path, name, got, wanted)
+
+
+def _refuse_misspelt(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    # Passed over in silence, 'max_forces' would mean a ranking by other forces than the file's.
+    absent = [name for name in FIELDS if name not in arrays]
+    if "frames" in arrays or "outward_normals" in arrays:
+        absent = [name for name in absent if name not in ("frames", "outward_normals")]
+    for name in arrays:
+        near = None if name in FIELDS else _nearest(name, absent, _SURELY_MEANT)
+        if near:
+            raise CandidateError(path, name, "an unknown field", f"{near!r}, the nearest known one, or another name")
+
+
+def _nearest(name: str, others: Iterable[str], cutoff: float) -> str | None:
+    by_lower = {other.lower(): other for other in others}
+    found = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=cutoff)
+    return by_lower[found[0]] if found else None
+
+
+def _numbers(path: Path, name: str, value: np.ndarray) -> np.ndarray:
+    if value.dtype.kind not in "iuf":
+        raise CandidateError(path, name, f"dtype {value.dtype}", "real numbers")
+    return value.astype(np.float64, copy=False)
+
+
+def _active(path: Path, value: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
+    if value is None:
+        return np.broadcast_to(True, shape)
+    if value.dtype != np.bool_ or value.shape != shape:
+        raise CandidateError(path, "active", f"dtype {value.dtype}, shape {value.shape}", f"bool {shape}")
+    return value
+
+
+def _travelling(path: Path, arrays: dict[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
+    columns = {}
+    for name, value in arrays.items():
+        known = name in FIELDS and name != "center_of_mass"
+        if known or value.ndim == 0 or value.shape[0] != count:
+            continue
+        if value.dtype.kind == "S":
+            value = np.char.decode(value, "utf-8", "replace")
+        if value.dtype.kind not in "biufU":
+            raise CandidateError(path, name, f"dtype {value.dtype}", "numbers, booleans or text")
+        plain = (
+            np.float64 if value.dtype.kind == "f" and value.itemsize not in (4, 8) else value.dtype.newbyteorder("=")
+        )
+        columns[name] = value.astype(plain, copy=False)
+    if "center_of_mass" in arrays and columns.get("center_of_mass", np.empty(0)).shape != (count, 3):
+        raise CandidateError(path, "center_of_mass", f"shape {arrays['center_of_mass'].shape}", f"({count}, 3)")
+    return columns

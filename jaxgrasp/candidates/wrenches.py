@@ -1,0 +1,38 @@
+"""Disturbances from a file: a list of wrenches."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxgrasp.candidates.archive import CandidateError, read_archive, read_array
+
+
+def read_wrenches(path: Path | str) -> Float[np.ndarray, "directions 6"]:
+    """Reads disturbance wrenches, whose convex hull with the origin is the set of disturbances.
+
+    Args:
+        path: An `.npz` file with the field `wrenches`, or an `.npy` file: (n_d, 6), force in N and moment about the
+            centre of mass in N m, in the object frame.
+
+    Returns:
+        The wrenches.
+
+    Raises:
+        CandidateError: The file cannot be read, or what it has is not finite numbers of that shape.
+    """
+    path = Path(path)
+    if path.suffix == ".npy":
+        field, wrenches = None, read_array(path)
+    else:
+        field, arrays = "wrenches", read_archive(path)
+        if field not in arrays:
+            raise CandidateError(
+                path, field, f"no such field (there is {', '.join(arrays) or 'nothing'})", "wrenches (n_d, 6)"
+            )
+        wrenches = arrays[field]
+    if wrenches.dtype.kind not in "iuf" or wrenches.ndim != 2 or wrenches.shape[0] == 0 or wrenches.shape[1] != 6:
+        raise CandidateError(path, field, f"dtype {wrenches.dtype}, shape {wrenches.shape}", "real numbers (n_d, 6)")
+    if not np.isfinite(wrenches).all():
+        raise CandidateError(path, field, "NaN or infinite entries", "finite wrenches")
+    return wrenches.astype(np.float64)
