@@ -1,0 +1,109 @@
+"""The package is a house with floors: a room imports only from rooms below it, read from the imports themselves."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "jaxgrasp"
+
+FLOORS = {
+    "arrays": 0,
+    "fence": 0,
+    "geometry": 1,
+    "contact": 1,
+    "disturbance": 1,
+    "solvers": 1,
+    "robustness": 2,
+    "metrics": 3,
+    "hands": 3,
+    "candidates": 3,
+    "simulation": 4,
+    "synthesis": 5,
+    "ranking": 5,
+    "viewer": 6,
+    "cli": 7,
+}
+# Packages that only some rooms may import.
+RESERVED = {"mujoco": {"hands", "simulation", "viewer"}, "optax": {"synthesis"}}
+
+FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+def room_of(module: str) -> str:
+    return module.split(".")[1]
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(source: str, package: str) -> set[str]:
+    """Every module that the source imports, wherever in it, by its absolute name; `from a import b` counts as a.b."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join(parents + ([node.module] if node.module else []))
+            found |= {f"{base}.{alias.name}" for alias in node.names}
+    return found
+
+
+def violations(room: str, imported: set[str]) -> list[str]:
+    wrong = []
+    for name in sorted(imported):
+        top = name.split(".")[0]
+        if top in RESERVED and room not in RESERVED[top]:
+            wrong.append(f"{room} imports {top}")
+        if top != "jaxgrasp":
+            continue
+        other = room_of(name) if "." in name else ""
+        if other not in FLOORS:
+            wrong.append(f"{room} imports the package's face ({name})")
+        elif other != room and FLOORS[other] >= FLOORS[room]:
+            wrong.append(f"{room} imports {name}, which is not below it")
+    return wrong
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_of)
+def test_imports_only_from_floors_below(path):
+    module = module_of(path)
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    assert room_of(module) in FLOORS
+    assert violations(room_of(module), imports(path.read_text(), package)) == []
+
+
+@pytest.mark.parametrize(
+    ("room", "source"),
+    [
+        ("solvers", "from jaxgrasp.contact import Contacts"),
+        ("contact", "import jaxgrasp.solvers.block_kkt"),
+        ("contact", "from jaxgrasp import solvers"),
+        ("contact", "def late():\n    from ..robustness import tightening"),
+        ("ranking", "from jaxgrasp import rank"),
+        ("ranking", "import jaxgrasp as jg"),
+        ("robustness", "import mujoco.mjx"),
+        ("hands", "import optax"),
+    ],
+)
+def test_a_wrong_import_is_seen(room, source):
+    assert len(violations(room, imports(source, f"jaxgrasp.{room}"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("room", "source"),
+    [
+        ("robustness", "from jaxgrasp.contact import Contacts\nfrom jaxgrasp.solvers import interior_point"),
+        (
+            "solvers",
+            "from jaxgrasp.solvers.status import Status\nfrom .status import Status\nfrom jaxgrasp import arrays",
+        ),
+        ("synthesis", "import optax, mujoco_menagerie"),
+        ("hands", "from mujoco import mjx"),
+    ],
+)
+def test_a_right_import_passes(room, source):
+    assert violations(room, imports(source, f"jaxgrasp.{room}")) == []
