@@ -1,1 +1,22 @@
 """Rank multi-fingered grasps by how strong a disturbance they withstand, in batch, with the forces that do it."""
+
+from jaxgrasp import solvers
+from jaxgrasp.contact import Compliance, Contacts, grasp_map, required_wrench
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness import Solution, blocking_forces, largest_disturbance, least_effort, worst_case
+from jaxgrasp.solvers.status import Status
+
+__all__ = [
+    "Compliance",
+    "Contacts",
+    "DisturbanceSet",
+    "Solution",
+    "Status",
+    "blocking_forces",
+    "grasp_map",
+    "largest_disturbance",
+    "least_effort",
+    "required_wrench",
+    "solvers",
+    "worst_case",
+]

@@ -4,6 +4,7 @@ Inside kernels the lanes trail: directions are (6, rows..., *lanes), the leaves 
 where shared.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, Self
 
@@ -13,8 +14,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import safe_norm
+from jaxgrasp.fence import fenced
 
-_CHUNK = 16
 
 
 class Term(Protocol):
@@ -41,6 +42,10 @@ class Term(Protocol):
         """(6, *lanes): the largest |w_i| for every component."""
         ...
 
+    def admissible(self) -> jax.Array:
+        """bool (*lanes): the data describe a set, given that they are finite."""
+        ...
+
 
 def _combine(weights: jax.Array, directions: jax.Array) -> jax.Array:
     """Sum over six components of weights (6, *lanes) with directions (6, ..., *lanes)."""
@@ -48,6 +53,21 @@ def _combine(weights: jax.Array, directions: jax.Array) -> jax.Array:
     for i in range(1, 6):
         total = total + _align(weights[i], directions[0]) * directions[i]
     return total
+
+
+def _chunk(row: jax.Array, lanes: tuple[int, ...]) -> int:
+    """How many vertices to work on at a time.
+
+    Many, so that directions are read seldom; but XLA's CPU backend cuts an operation in parallel tasks, which cannot be done inside a tile,
+    where it counts more than one flop a byte and 2e5 of flops + 10 bytes.
+    """
+    size, width = row.size, row.dtype.itemsize
+    for chunk in (16, 8, 4, 2):
+        flops = 12 * chunk * size
+        moved = (8 * size + 6 * chunk * math.prod(lanes)) * width
+        if flops <= 0.9 * moved or flops + 10 * moved < 1.8e5:
+            return chunk
+    return 1
 
 
 def _align(leaf: jax.Array, like: jax.Array) -> jax.Array:
@@ -79,7 +99,10 @@ class Vertices:
 
     def support(self, directions: jax.Array) -> jax.Array:
         """A running maximum over the vertices, a few at a time: memory does not grow with their number."""
+        if directions.ndim > self.wrenches.ndim:
+            return lax.map(self.support, jnp.moveaxis(directions, 1, 0))
         count, wrenches = self.wrenches.shape[0], self.wrenches
+        chunk = min(count, _chunk(directions[0], wrenches.shape[2:]))
 
         def raise_to(best: jax.Array, some: jax.Array) -> jax.Array:
             for j in range(some.shape[0]):
@@ -87,19 +110,25 @@ class Vertices:
             return best
 
         best = jnp.zeros_like(directions[0])
-        if count <= _CHUNK:
-            return raise_to(best, wrenches)
-        chunks = -(-count // _CHUNK)
-        padded = jnp.pad(wrenches, [(0, chunks * _CHUNK - count)] + [(0, 0)] * (wrenches.ndim - 1))
+        if count == 0:
+            return best
+        chunks = -(-count // chunk)
+        padded = jnp.pad(wrenches, [(0, chunks * chunk - count)] + [(0, 0)] * (wrenches.ndim - 1))
+        if chunks == 1:
+            return fenced(raise_to)(best, padded)
 
         def body(i: jax.Array, best: jax.Array) -> jax.Array:
-            return raise_to(best, lax.dynamic_slice_in_dim(padded, i * _CHUNK, _CHUNK))
+            return raise_to(best, lax.dynamic_slice_in_dim(padded, i * chunk, chunk))
 
         return lax.fori_loop(0, chunks, body, best)
 
     def extent(self) -> jax.Array:
         """Componentwise maximum."""
         return jnp.max(jnp.abs(self.wrenches), 0, initial=0)
+
+    def admissible(self) -> jax.Array:
+        """Any wrenches do."""
+        return jnp.array(True)
 
 
 @jax.tree_util.register_dataclass
@@ -143,6 +172,10 @@ class Box:
         turned = jnp.abs(self.axes)
         return jnp.stack([sum(turned[r, c] * self.half_extents[h + c] for c in range(3)) for h in (0, 3) for r in range(3)])
 
+    def admissible(self) -> jax.Array:
+        """No negative extent."""
+        return (self.half_extents >= 0).all(0)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +206,10 @@ class Ellipsoid:
     def extent(self) -> jax.Array:
         """Row norms."""
         return safe_norm(self.shape_matrix, 1)
+
+    def admissible(self) -> jax.Array:
+        """Any matrix does."""
+        return jnp.array(True)
 
 
 @jax.tree_util.register_dataclass
@@ -205,3 +242,7 @@ class Ball:
     def extent(self) -> jax.Array:
         """Radii."""
         return jnp.stack([*[self.force] * 3, *[self.torque] * 3])
+
+    def admissible(self) -> jax.Array:
+        """No negative radius."""
+        return (self.force >= 0) & (self.torque >= 0)

@@ -221,7 +221,7 @@ class BlockProblem:
             squares = []
             for g, f, w in zip(self.groups, blocks, weights, strict=True):
                 # As a sum of squares: sigma'W sigma - p'P^-1 p would cancel near the optimum.
-                lean = g.sigma - _apply(g.patterns, jnp.stack(f.phi))
+                lean = fenced(lambda phi, sigma, g=g: sigma - _apply(g.patterns, jnp.stack(phi)))(f.phi, g.sigma)
                 squares.append(_total(fold(jnp.add, w * lean * lean)))
             kappa = fold(jnp.add, squares)
             border = 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
@@ -283,6 +283,14 @@ class MarginProblem(BlockProblem):
             parts.append(fold(jnp.minimum, fold(jnp.minimum, ratio)))
         return fold(jnp.minimum, parts)
 
+    def violations(self, x: Rows, lam: jax.Array) -> jax.Array:
+        """Largest amount by which any row is missed, (*lanes)."""
+        missed = [jnp.abs(e - b) for e, b in zip(self.equality(x), self.rhs, strict=True)]
+        for g, x_g in zip(self.groups, x, strict=True):
+            over = _apply(g.patterns, x_g) + g.sigma * lam - g.h
+            missed.append(fold(jnp.maximum, fold(jnp.maximum, over)))
+        return jnp.maximum(fold(jnp.maximum, missed), 0)
+
     def start(self) -> Iterate:
         blocks, slacks, scales, lambdas = [], [], [], []
         for g in self.groups:
@@ -341,9 +349,11 @@ class MarginProblem(BlockProblem):
         return (dx, dlambda), jnp.stack(dy), rows
 
     def first_record(self) -> Record:
-        inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
-        start = self.start()
-        return Record(-inf, inf, start.x[0], start.y, start.z)
+        """The smallest forces that meet E x = b attain a first bound; without a load it is lambda = 0, exactly."""
+        nothing = tuple(jnp.zeros((g.patterns.shape[1], *g.present.shape), self.rhs.dtype) for g in self.groups)
+        x = self.project(nothing)
+        z = tuple(jnp.zeros_like(g.sigma) for g in self.groups)
+        return Record(self.attained(x), jnp.full(self.lanes, jnp.inf, self.rhs.dtype), x, jnp.zeros_like(self.rhs), z)
 
     def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
         x = self.project(iterate.x[0])

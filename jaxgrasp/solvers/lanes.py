@@ -17,29 +17,31 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxgrasp.fence import fences
 
 Tree = Any
-TILE = 64
+# Values of one row of a tile; 64 lanes of four contacts were fastest, and a tile has to fit in the second-level cache.
+TILE = 256
 LARGE_TILE = 1 << 17
 
 
-def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree) -> Tree:
+def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree, blocks: int) -> Tree:
     """Run a kernel over the leading axis of its arguments.
 
     Args:
         kernel: takes the tree of arguments with the lane axis last (size 1 where shared), returns a tree of arrays with the lane axis last.
         arguments: leaves (lanes, ...), or without the leading axis where shared.
         shared: like arguments, bool: the leaf is the same for all lanes.
+        blocks: how many blocks (contacts) a lane has, which sets the size of a tile.
 
     Returns:
         The kernel's tree, leaves (lanes, ...).
     """
     leaves, structure = jax.tree.flatten(arguments)
-    return _run(kernel, structure, tuple(jax.tree.leaves(shared)))(leaves)
+    return _run(kernel, structure, tuple(jax.tree.leaves(shared)), blocks)(leaves)
 
 
-def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...]) -> Callable:
+def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int) -> Callable:
     @custom_vmap
     def run(leaves: list[jax.Array]) -> Tree:
-        return _tiled(kernel, structure, shared, leaves)
+        return _tiled(kernel, structure, shared, blocks, leaves)
 
     @run.def_vmap
     def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
@@ -56,14 +58,16 @@ def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...]) -> Callable
             elif not is_batched:
                 leaf = jnp.broadcast_to(leaf[None], (size, *leaf.shape))
             merged.append(leaf.reshape(size * lanes, *leaf.shape[2:]))
-        out = _run(kernel, structure, tuple(still_shared))(merged)
+        out = _run(kernel, structure, tuple(still_shared), blocks)(merged)
         out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     return run
 
 
-def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], leaves: list[jax.Array]) -> Tree:
+def _tiled(
+    kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int, leaves: list[jax.Array]
+) -> Tree:
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
 
     def solve(parts: list[jax.Array]) -> Tree:
@@ -93,7 +97,7 @@ def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], leaves: l
             with fences(True), set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
                 return tile(parts)
 
-        return in_tiles(min(TILE, lanes), one)
+        return in_tiles(min(max(16, TILE // blocks // 8 * 8), 64, lanes), one)
 
     def elsewhere() -> Tree:
         return in_tiles(min(LARGE_TILE, lanes), solve)

@@ -1,0 +1,45 @@
+"""Blocking forces: how the fingers answer while a disturbance acts, (14)-(15)."""
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxgrasp.contact.compliance import Compliance, pseudo_inverse
+from jaxgrasp.contact.contacts import Contacts
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.grasps import Grasps, over_grasps
+
+
+def blocking_forces(
+    contacts: Contacts, wrenches: ArrayLike, compliance: ArrayLike | Compliance | None = None
+) -> Float[Array, "*batch directions contacts 3"]:
+    """Blocking forces delta f_j = -G*_j W_j (15): of all contact forces that balance W_j, those with the least delta f' Q delta f.
+
+    They are for lambda = 1 and add to the tightening forces f_0 while disturbance j acts. On a rank-deficient grasp they balance what lies in the range of G.
+
+    Args:
+        contacts: the grasps.
+        wrenches: W (*batch, n_d, 6), disturbances on the object, N and N m, object frame.
+        compliance: Q, as in `largest_disturbance`; one each with `Compliance.per_direction`.
+
+    Returns:
+        (*batch, n_d, n_c, 3), N, contact frames; 0 for absent contacts, NaN where the data are not admissible.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+
+    def kernel(grasps: Grasps) -> jax.Array:
+        w = grasps.terms[0].wrenches
+        scaled = jnp.concatenate([w[:, :3], w[:, 3:] / grasps.length], 1)
+        if grasps.vertex_halves is None:
+            inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+            forces = -jnp.einsum("aen...,de...->dna...", inverse, scaled)
+        else:
+            one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
+            forces = jax.lax.map(one, (grasps.vertex_halves, jnp.broadcast_to(scaled, (*w.shape[:2], *grasps.length.shape))))
+        forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
+        return jnp.where(grasps.valid, forces, jnp.nan)
+
+    return over_grasps(kernel, contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)

@@ -1,0 +1,221 @@
+"""From the public, batch-first arguments to the lanes that the kernels work on, with every check of the data."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.contact.compliance import Compliance, inverse_root
+from jaxgrasp.contact.contacts import Contacts
+from jaxgrasp.contact.grasp_map import grasp_columns
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.disturbance.terms import Box, Term, Vertices
+from jaxgrasp.solvers.lanes import map_lanes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grasps:
+    """Grasps in lanes (the trailing axis), made safe: what is absent or not admissible is replaced by harmless data.
+
+    Moments are divided by `length`, so that all wrench components are forces.
+    """
+
+    valid: jax.Array
+    """(*lanes), bool: all data of the lane are admissible; the others have no contact present."""
+    present: jax.Array
+    """(n, *lanes), 1 where a contact is there, else 0."""
+    friction: jax.Array
+    """(n, *lanes)."""
+    max_force: jax.Array
+    """(n, *lanes), N."""
+    length: jax.Array
+    """(*lanes), root-mean-square distance of the contacts from the centre of mass, m; 1 where that is zero."""
+    columns: jax.Array
+    """(6, 3, n, *lanes), the blocks of G; zero where absent."""
+    wrench: jax.Array
+    """(6, *lanes), b, N."""
+    reserve: jax.Array
+    """(*lanes), d, N."""
+    terms: tuple[Term, ...]
+    """The disturbance set, moments in N m; leaves may have lanes of size 1."""
+    half: jax.Array | None
+    """M with M M' = Q^-1, see `inverse_root`; None for Q = I."""
+    vertex_halves: jax.Array | None
+    """The same for each vertex of the disturbance set, along the leading axis."""
+    weights: jax.Array | None
+    """(n, 3, 3, *lanes), blocks of Q_0; None for I."""
+    margin: jax.Array | None
+    """(*lanes), the margin that is asked for."""
+
+
+def over_grasps(
+    kernel: Callable[[Grasps], Any],
+    contacts: Contacts,
+    disturbances: DisturbanceSet,
+    *,
+    required_wrench: Any = None,
+    compliance: Any = None,
+    cone_margin: Any = 0.0,
+    effort_weights: Any = None,
+    margin: Any = None,
+) -> Any:
+    """Check shapes, run a kernel over all grasps of a batch and give its results the batch's shape.
+
+    The contacts' dtype is the precision of everything.
+
+    Raises:
+        ValueError: shapes or kinds of argument that do not fit.
+    """
+    if not isinstance(contacts, Contacts):
+        raise ValueError(f"contacts: got {type(contacts).__name__}, wanted jaxgrasp.Contacts")
+    if not isinstance(disturbances, DisturbanceSet):
+        raise ValueError(f"disturbances: got {type(disturbances).__name__}, wanted jaxgrasp.DisturbanceSet")
+    n = contacts.n_c
+    own = {name: (getattr(contacts, name), contacts.batch_shape) for name in _CONTACT_LEAVES}
+    other: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "wrench": _argument("required_wrench", np.zeros(6) if required_wrench is None else required_wrench, (6,)),
+        "reserve": _argument("cone_margin", cone_margin, ()),
+    }
+    if isinstance(compliance, Compliance):
+        other["per_vertex"] = _per_vertex(compliance, disturbances, n)
+    elif compliance is not None:
+        other["compliance"] = _compliance(compliance, n)
+    if effort_weights is not None:
+        other["weights"] = _argument("effort_weights", effort_weights, (n, 3, 3))
+    if margin is not None:
+        other["margin"] = _argument("margin", margin, ())
+    batch = broadcast_batch(
+        contacts=contacts.batch_shape,
+        disturbances=disturbances.batch_shape,
+        **{_PUBLIC.get(name, name): lead for name, (_, lead) in other.items()},
+    )
+    dtype = contacts.positions.dtype
+    terms, structure = jax.tree.flatten(disturbances.spread_over(batch) if disturbances.batch_shape else disturbances)
+    lead = batch if disturbances.batch_shape else ()
+    leaves = {**own, **other, **{f"term {i}": (leaf, lead) for i, leaf in enumerate(terms)}}
+
+    arguments, shared = {}, {}
+    for name, (leaf, lead) in leaves.items():
+        leaf = leaf if leaf.dtype == bool else leaf.astype(dtype)
+        shared[name] = not lead and name not in own
+        if not shared[name]:
+            event = leaf.shape[len(lead) :]
+            leaf = jnp.broadcast_to(leaf, (*batch, *event)).reshape(-1, *event)
+        arguments[name] = leaf
+
+    def run(raw: dict[str, jax.Array]) -> Any:
+        terms = jax.tree.unflatten(structure, [raw[f"term {i}"] for i in range(structure.num_leaves)])
+        return kernel(_admit(raw, terms.terms))
+
+    out = map_lanes(run, arguments, shared, n)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
+
+
+_CONTACT_LEAVES = ("positions", "frames", "friction", "max_force", "active")
+_PUBLIC = {"wrench": "required_wrench", "reserve": "cone_margin", "per_vertex": "compliance", "weights": "effort_weights"}
+
+
+def _argument(name: str, value: Any, event: tuple[int, ...]) -> tuple[jax.Array, tuple[int, ...]]:
+    array = as_float(name, value, event)
+    return array, array.shape[: array.ndim - len(event)]
+
+
+def _compliance(value: Any, n: int) -> tuple[jax.Array, tuple[int, ...]]:
+    array = as_float("compliance", value, ("rows", "columns"))
+    for event in ((n, 3, 3), (3 * n, 3 * n)):
+        if array.shape[-len(event) :] == event:
+            return array, array.shape[: array.ndim - len(event)]
+    raise ValueError(f"compliance: got shape {array.shape}, wanted (*batch, {n}, 3, 3) or (*batch, {3 * n}, {3 * n})")
+
+
+def _per_vertex(compliance: Compliance, disturbances: DisturbanceSet, n: int) -> tuple[jax.Array, tuple[int, ...]]:
+    if len(disturbances.terms) != 1 or not isinstance(disturbances.terms[0], Vertices):
+        raise ValueError(
+            "compliance: got one Q for each direction, wanted a single Q, since the disturbance set is not given by vertices; "
+            "use DisturbanceSet.vertices"
+        )
+    array, count = compliance.per_vertex, disturbances.terms[0].wrenches.shape[-2]
+    for event in ((count, n, 3, 3), (count, 3 * n, 3 * n)):
+        if array.shape[-len(event) :] == event:
+            return array, array.shape[: array.ndim - len(event)]
+    raise ValueError(
+        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or (*batch, {count}, {3 * n}, {3 * n}), "
+        f"one Q for each of the {count} wrenches"
+    )
+
+
+def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...]) -> Grasps:
+    """Check the data of every lane and replace what cannot be used."""
+    positions, frames, active = raw["positions"], raw["frames"], raw["active"]
+    n, dtype = positions.shape[0], positions.dtype
+    sound = jnp.isfinite(positions).all(1) & _rotations(frames)
+    sound &= (raw["friction"] >= 0) & jnp.isfinite(raw["friction"])
+    sound &= (raw["max_force"] > 0) & jnp.isfinite(raw["max_force"])
+    half, usable = inverse_root(_masked(raw.get("compliance"), active), n)
+    valid = (sound | ~active).all(0) & usable
+    # One Q a direction: the directions trail the lanes while the roots are taken.
+    vertex_halves = None
+    if "per_vertex" in raw:
+        each = jnp.moveaxis(raw["per_vertex"], 0, -1)
+        vertex_halves, usable = inverse_root(_masked(each, active[..., None]), n)
+        vertex_halves, valid = jnp.moveaxis(vertex_halves, -1, 0), valid & usable.all(-1)
+    weights = _masked(raw.get("weights"), active)
+    valid &= inverse_root(weights, n)[1]
+    valid &= jnp.isfinite(raw["wrench"]).all(0) & (raw["reserve"] >= 0) & jnp.isfinite(raw["reserve"])
+    for term in terms:
+        valid &= jnp.isfinite(term.extent()).all(0) & term.admissible()
+    margin = raw.get("margin")
+    if margin is not None:
+        valid &= (margin >= 0) & jnp.isfinite(margin)
+        margin = jnp.where(valid, margin, 0)
+
+    there = active & valid
+    positions = jnp.where(there, jnp.moveaxis(positions, 1, 0), 0)
+    frames = jnp.where(there, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
+    mean = jnp.sum(positions**2, (0, 1)) / jnp.maximum(jnp.sum(there, 0), 1).astype(dtype)
+    length = jnp.sqrt(jnp.where(mean > 0, mean, 1))
+    wrench = jnp.where(valid, raw["wrench"], 0)
+    return Grasps(
+        valid=valid,
+        present=there.astype(dtype),
+        friction=jnp.where(there, raw["friction"], 1),
+        max_force=jnp.where(there, raw["max_force"], 1),
+        length=length,
+        columns=grasp_columns(positions / length, frames),
+        wrench=jnp.concatenate([wrench[:3], wrench[3:] / length]),
+        reserve=jnp.where(valid, raw["reserve"], 0),
+        terms=terms,
+        half=half,
+        vertex_halves=vertex_halves,
+        weights=weights,
+        margin=margin,
+    )
+
+
+def _rotations(frames: jax.Array) -> jax.Array:
+    """Which frames (n, 3, 3, *lanes) are rotations, (n, *lanes)."""
+    tolerance = 1e-6 if frames.dtype == jnp.float64 else 1e-4
+    t1, t2, normal = ([frames[:, r, a] for r in range(3)] for a in range(3))
+    cross = [t1[1] * t2[2] - t1[2] * t2[1], t1[2] * t2[0] - t1[0] * t2[2], t1[0] * t2[1] - t1[1] * t2[0]]
+    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # noqa: E731
+    near = lambda x, y: jnp.abs(x - y) <= tolerance  # noqa: E731
+    aligned = near(cross[0], normal[0]) & near(cross[1], normal[1]) & near(cross[2], normal[2])
+    return near(dot(t1, t1), 1) & near(dot(t2, t2), 1) & near(dot(t1, t2), 0) & aligned
+
+
+def _masked(matrices: jax.Array | None, active: jax.Array) -> jax.Array | None:
+    """Blocks or full matrices of contacts with the absent ones' rows and columns replaced by the identity's."""
+    if matrices is None:
+        return None
+    full = matrices.shape[:2] == (3 * active.shape[0],) * 2
+    eye = jnp.eye(matrices.shape[1], dtype=matrices.dtype).reshape(
+        (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (active.ndim - 1)
+    )
+    if not full:
+        return jnp.where(active[:, None, None], matrices, eye)
+    there = jnp.repeat(active, 3, 0)
+    return jnp.where(there[:, None] & there[None], matrices, eye)

@@ -1,0 +1,141 @@
+"""The scaled form of (21) and (22) that the solver sees.
+
+Per contact with F = f_max: tangential forces in units of mu F, normal forces in units of F, so that all facet rows become the same constants and
+forces are of order one. sigma = -Lambda S_1 / (mu F) and Lambda S_2 / F, with Lambda such that the largest is 1: lambda = Lambda * lambda_hat. The six rows
+of G are orthonormalised, and rows that add nothing are dropped.
+"""
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, row_basis
+from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.fence import fenced
+from jaxgrasp.robustness.grasps import Grasps
+from jaxgrasp.robustness.worst_case import reaches_outside, worst_rows
+from jaxgrasp.solvers.block_kkt import Blocks
+
+# Friction below this is scaled like this: tangential forces then stay below it in units of f_max, which is as good as none.
+_LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Program:
+    """Scaled data of a batch of grasps; lanes trail."""
+
+    blocks: Blocks
+    """Contacts with their rows: n_e facets, then the bound on the normal force."""
+    rhs: jax.Array
+    """(6, *lanes), coordinates of b in the orthonormal rows; zero where dropped."""
+    dropped: jax.Array
+    """(6, *lanes), 1 where a row of G was dropped."""
+    radius: float
+    """|x|_inf <= 1 + radius * max(0, -lambda_hat) at the optimum."""
+    scale: jax.Array
+    """Lambda, (*lanes), N per unit of disturbance."""
+    tangential: jax.Array
+    """mu F, (n, *lanes), N."""
+    normal: jax.Array
+    """F, (n, *lanes), N."""
+    operations: Basis
+    """Row operations from G in newtons to the orthonormal rows, for forces in units of `mean`."""
+    mean: jax.Array
+    """Mean of F, (*lanes), N."""
+    rank: jax.Array
+    """Rank of G, (*lanes)."""
+    doubtful: jax.Array
+    """bool (*lanes): the rank cannot be told in this precision."""
+    undisturbed: jax.Array
+    """bool (*lanes): S_1 = S_2 = 0."""
+    disturbance_outside: jax.Array
+    """bool (*lanes): the set has wrenches outside the range of G."""
+    wrench_outside: jax.Array
+    """bool (*lanes): b is outside the range of G."""
+    slippery: jax.Array
+    """bool (*lanes): a contact without friction has to bear tangential force, so the margin cannot be positive."""
+
+    def forces(self, x: jax.Array) -> jax.Array:
+        """Contact forces (n, 3, *lanes), N, from scaled ones (3, n, *lanes)."""
+        return jnp.stack([x[0] * self.tangential, x[1] * self.tangential, x[2] * self.normal], 1)
+
+    def row_units(self) -> jax.Array:
+        """What one unit of every scaled row is in newtons, (n_e + 1, n, *lanes)."""
+        edges = self.blocks.patterns.shape[0] - 1
+        return jnp.concatenate([jnp.broadcast_to(self.tangential, (edges, *self.tangential.shape)), self.normal[None]])
+
+    def wrench_multipliers(self, y: jax.Array, length: jax.Array) -> jax.Array:
+        """Multipliers of G f = b (6, *lanes) from those of the orthonormal rows, per unit of the scaled objective."""
+        entries = []
+        for column in range(6):
+            rows = range(column, 6)
+            entries.append(sum(self.operations.operations[r][column] * y[r] * self.operations.kept[r] for r in rows))
+        stacked = jnp.stack(entries) / self.mean
+        return jnp.concatenate([stacked[:3], stacked[3:] / length])
+
+
+def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
+    """Scale the programs of a batch of grasps."""
+    present, dtype = grasps.present, grasps.present.dtype
+    cone, bound, basis = worst_rows(grasps, cone_edges)
+    tangential = jnp.maximum(grasps.friction, _LEAST_FRICTION[dtype.name]) * grasps.max_force
+    normal = grasps.max_force
+
+    @fenced
+    def scale_rows(cone: jax.Array, bound: jax.Array, tangential: jax.Array, normal: jax.Array, reserve: jax.Array) -> tuple:
+        sigma = jnp.concatenate([cone / tangential, (bound / normal)[None]])
+        largest = jnp.max(sigma, (0, 1))
+        undisturbed = largest == 0
+        scale = 1 / jnp.where(undisturbed, 1, largest)
+        sigma = jnp.where(undisturbed, present, sigma * scale)
+        # What is left of a zero after rounding is a zero.
+        sigma = jnp.where(sigma > 8 * jnp.finfo(dtype).eps, sigma, 0)
+        lost = jnp.where(present > 0, -reserve / tangential, 1)
+        h = jnp.concatenate([jnp.broadcast_to(lost, cone.shape), jnp.ones_like(bound)[None]])
+        return sigma, h, scale, undisturbed
+
+    sigma, h, scale, undisturbed = scale_rows(cone, bound, tangential, normal, grasps.reserve)
+    mean = jnp.sum(normal * present, 0) / jnp.maximum(jnp.sum(present, 0), 1)
+    mean = jnp.where(mean > 0, mean, 1)
+    columns = grasps.columns * (jnp.stack([tangential, tangential, normal]) / mean)
+    rows = row_basis(list(columns))
+    wrench = grasps.wrench / mean
+    coordinates = jnp.stack(rows.coordinates(wrench))
+    kept = jnp.stack(rows.kept)
+    largest = jnp.max(jnp.abs(wrench), 0)
+    outside = jnp.max(jnp.abs(coordinates) * (1 - kept), 0) > 10 * RANK_TOLERANCE[dtype.name] * largest
+    facets = pyramid_facets(cone_edges)
+    return Program(
+        blocks=Blocks(
+            patterns=np.concatenate([facets, [[0.0, 0.0, -1.0]]]),
+            columns=jnp.stack(rows.rows),
+            sigma=sigma,
+            h=h,
+            present=present,
+        ),
+        rhs=coordinates * kept,
+        dropped=1 - kept,
+        radius=1 + 1 / math.cos(math.pi / cone_edges),
+        scale=scale,
+        tangential=tangential,
+        normal=normal,
+        operations=rows,
+        mean=mean,
+        rank=basis.rank.astype(jnp.int32),
+        doubtful=_doubtful(basis),
+        undisturbed=undisturbed,
+        disturbance_outside=reaches_outside(grasps, basis),
+        wrench_outside=outside,
+        slippery=((grasps.friction <= 0) & (jnp.max(cone, 0) > 0)).any(0),
+    )
+
+
+def _doubtful(basis: Basis) -> jax.Array:
+    """A row between clearly dependent and clearly independent; float64 is fine enough to decide."""
+    ratios = jnp.stack(basis.ratios)
+    if ratios.dtype == jnp.float64:
+        return jnp.zeros(ratios.shape[1:], bool)
+    return ((ratios > 1e-5) & (ratios < 1e-3)).any(0)

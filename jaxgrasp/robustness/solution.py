@@ -1,0 +1,52 @@
+"""What (21) and (22) answer."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxgrasp.contact.contacts import Contacts
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """Tightening forces of a batch of grasps, with what certifies them."""
+
+    margin: Float[Array, "*batch"]
+    """lambda, certified from below: the factor by which the disturbance set may be scaled while `forces` hold the object. Negative where the
+    required wrench itself cannot be borne; NaN where there is no answer; inf where nothing disturbs."""
+    upper_bound: Float[Array, "*batch"]
+    """No forces whatever reach a margin above this one."""
+    forces: Float[Array, "*batch contacts 3"]
+    """f_0 in contact frames (t1, t2, n), N; 0 for absent contacts, NaN where there is no answer."""
+    effort: Float[Array, "*batch"]
+    """1/2 f_0' Q_0 f_0; Q_0 is the identity unless effort weights were given."""
+    status: Int[Array, "*batch"]
+    """`Status` of every grasp."""
+    iterations: Int[Array, "*batch"]
+    """Interior-point steps taken; of both programs for (22)."""
+    primal_residual: Float[Array, "*batch"]
+    """Largest violation of any row by `forces` at `margin` (at the margin asked for in (22)), in units of the mean f_max."""
+    dual_residual: Float[Array, "*batch"]
+    """Largest entry of the stationarity condition in the scaled program."""
+    gap: Float[Array, "*batch"]
+    """Certified gap: (upper_bound - margin) / max(Lambda, |margin|) for (21), with Lambda the margin's natural scale; that of the effort for (22)."""
+    rank: Int[Array, "*batch"]
+    """Rank of the grasp map."""
+    cone_multipliers: Float[Array, "*batch contacts edges"]
+    """z >= 0 of C f_0 - S_1 lambda <= -d."""
+    bound_multipliers: Float[Array, "*batch contacts"]
+    """z >= 0 of -E f_0 + S_2 lambda <= f_max."""
+    wrench_multipliers: Float[Array, "*batch 6"]
+    """y of G f_0 = b: how the optimum changes with b, for (21) d margin / d b, for (22) -d effort / d b."""
+
+    def forces_in_object_frame(self, contacts: Contacts) -> Float[Array, "*batch contacts 3"]:
+        """Forces of the fingers on the object in the object frame, N.
+
+        Args:
+            contacts: the grasps that were solved.
+        """
+        turned = jnp.einsum("...ij,...j->...i", contacts.frames, self.forces)
+        return jnp.where(contacts.active[..., None], turned, self.forces)

@@ -1,0 +1,199 @@
+"""Tightening forces: the largest-minimum resisted disturbance (21) and the least effort (22)."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from jaxgrasp.contact.compliance import Compliance
+from jaxgrasp.contact.contacts import Contacts
+from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.program import Program, scaled_program
+from jaxgrasp.robustness.solution import Solution
+from jaxgrasp.solvers import interior_point
+from jaxgrasp.solvers.block_kkt import MarginProblem, Record
+from jaxgrasp.solvers.status import Status
+
+_SETTINGS = {
+    "float64": interior_point.Settings(
+        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=False, safeguard=0.0
+    ),
+    "float32": interior_point.Settings(
+        tolerance=3e-6, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3
+    ),
+}
+# A gap that did not close to the tolerance still counts as solved below this one.
+_ACCEPTED_GAP = {"float64": 1e-7, "float32": 1e-4}
+
+
+def largest_disturbance(
+    contacts: Contacts,
+    disturbances: DisturbanceSet,
+    required_wrench: ArrayLike | None = None,
+    compliance: ArrayLike | Compliance | None = None,
+    cone_edges: int = 8,
+    cone_margin: ArrayLike = 0.0,
+) -> Solution:
+    """The robustness margin: the largest factor lambda by which a set of disturbances may be scaled while the grasp holds, program (21).
+
+    max lambda over (f_0, lambda) subject to G f_0 = b, C f_0 - S_1 lambda <= -d, -E f_0 + S_2 lambda <= f_max.
+
+    lambda is left free: where even b cannot be borne the status is INFEASIBLE and a negative margin is the proof. A grasp without force
+    closure and without load has margin 0.
+
+    Args:
+        contacts: the grasps; their dtype is the precision.
+        disturbances: the set D; without batch axes it is shared by all grasps.
+        required_wrench: b (*batch, 6), N and N m, see `required_wrench`; None is zero.
+        compliance: Q of (14), contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3), full (*batch, 3 n_c, 3 n_c), or
+            `Compliance.per_direction`; None is the identity.
+        cone_edges: n_e, edges of the friction pyramid, which is inscribed in Coulomb's cone.
+        cone_margin: d (*batch,), N, >= 0: what every facet row keeps in reserve.
+
+    Returns:
+        Solution with `*batch` axes. `margin` is attained by `forces`, and no forces reach more than `upper_bound`.
+
+    Raises:
+        ValueError: shapes or options that do not fit; at trace time.
+
+    Status:
+        SOLVED; INFEASIBLE (b cannot be borne); UNBOUNDED (nothing disturbs, margin inf); INVALID_INPUT (data not admissible, for that
+        grasp alone); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot tell).
+    """
+    pyramid_facets(cone_edges)
+
+    def kernel(grasps: Grasps) -> Solution:
+        return _solve_margin(grasps, scaled_program(grasps, cone_edges))[0]
+
+    return over_grasps(
+        kernel,
+        contacts,
+        disturbances,
+        required_wrench=required_wrench,
+        compliance=compliance,
+        cone_margin=cone_margin,
+    )
+
+
+def least_effort(
+    contacts: Contacts,
+    disturbances: DisturbanceSet,
+    margin: ArrayLike,
+    required_wrench: ArrayLike | None = None,
+    compliance: ArrayLike | Compliance | None = None,
+    effort_weights: ArrayLike | None = None,
+    cone_edges: int = 8,
+    cone_margin: ArrayLike = 0.0,
+) -> Solution:
+    """The tightening forces of least effort that give a chosen margin, program (22).
+
+    min 1/2 f_0' Q_0 f_0 subject to the rows of (21) with lambda = margin. Solves (21) first, for a start and for the certificate where the margin
+    cannot be had.
+
+    Args:
+        contacts: the grasps; their dtype is the precision.
+        disturbances: the set D.
+        margin: lambda (*batch,), >= 0; usually a share, say 75 %, of (21)'s.
+        required_wrench: b (*batch, 6), N and N m; None is zero.
+        compliance: Q, as in `largest_disturbance`.
+        effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the identity.
+        cone_edges: n_e.
+        cone_margin: d (*batch,), N, >= 0.
+
+    Returns:
+        Solution; `margin` is what `forces` certify, at least the one asked for up to rounding, `upper_bound` that of (21).
+
+    Raises:
+        ValueError: shapes or options that do not fit; at trace time.
+
+    Status:
+        As in `largest_disturbance`; INFEASIBLE where the margin is above what (21) allows; INVALID_INPUT where it is negative or NaN.
+    """
+    pyramid_facets(cone_edges)
+
+    def kernel(grasps: Grasps) -> Solution:
+        program = scaled_program(grasps, cone_edges)
+        return _solve_effort(grasps, program, *_solve_margin(grasps, program))
+
+    return over_grasps(
+        kernel,
+        contacts,
+        disturbances,
+        required_wrench=required_wrench,
+        compliance=compliance,
+        cone_margin=cone_margin,
+        effort_weights=effort_weights,
+        margin=margin,
+    )
+
+
+def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
+    """(21) for lanes; also the scaled record, from which (22) starts."""
+    dtype = program.rhs.dtype
+    settings = _SETTINGS[dtype.name]
+    problem = MarginProblem((program.blocks,), program.rhs, program.dropped, program.radius)
+    outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
+    record = outcome.record
+    low, high = record.lower, record.upper
+    size = jnp.maximum(1, jnp.abs(low))
+    closed = high - low <= _ACCEPTED_GAP[dtype.name] * size
+    bearable = low >= -settings.tolerance
+
+    margin, upper = low * program.scale, high * program.scale
+    margin = jnp.where(program.slippery, jnp.minimum(margin, 0), margin)
+    upper = jnp.where(program.slippery, jnp.minimum(upper, 0), upper)
+    hopeless = high < -settings.tolerance
+    margin = jnp.where(hopeless & ~closed, jnp.nan, margin)
+    decided = [
+        (~grasps.valid, Status.INVALID_INPUT, jnp.nan),
+        (program.wrench_outside, Status.INFEASIBLE, jnp.nan),
+        (program.disturbance_outside & bearable, Status.SOLVED, 0.0),
+        (program.undisturbed & bearable, Status.UNBOUNDED, jnp.inf),
+        ((program.disturbance_outside | program.undisturbed) & hopeless, Status.INFEASIBLE, jnp.nan),
+    ]
+    status = jnp.select(
+        [c for c, _, _ in decided] + [hopeless, bearable & closed, program.doubtful],
+        [s for _, s, _ in decided] + [Status.INFEASIBLE, Status.SOLVED, Status.ILL_CONDITIONED],
+        Status.MAX_ITERATIONS,
+    ).astype(jnp.int32)
+    margin = jnp.select([c for c, _, _ in decided], [jnp.full_like(low, m) for *_, m in decided], margin)
+    upper = jnp.select([c for c, _, _ in decided], [jnp.full_like(low, m) for *_, m in decided], upper)
+
+    answered = grasps.valid & ~program.wrench_outside
+    forces = program.forces(record.x[0]) * program.blocks.present[:, None]
+    scale = program.scale
+    multipliers = record.z[0] * scale / program.row_units()
+    solution = Solution(
+        margin=margin,
+        upper_bound=upper,
+        forces=jnp.where(answered, forces, jnp.nan),
+        effort=jnp.where(answered, _effort(forces, None), jnp.nan),
+        status=status,
+        iterations=outcome.iterations,
+        primal_residual=problem.violations(record.x, low),
+        dual_residual=_largest(outcome.residuals.dual[0]),
+        gap=jnp.where(answered, (high - low) / size, jnp.nan),
+        rank=program.rank,
+        cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
+        bound_multipliers=multipliers[-1],
+        wrench_multipliers=program.wrench_multipliers(record.y, grasps.length) * scale,
+    )
+    return solution, record
+
+
+def _effort(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
+    """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
+    weighed = forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
+    return 0.5 * jnp.sum(forces * weighed, (0, 1))
+
+
+def _largest(rows: tuple) -> jax.Array:
+    return jnp.max(jnp.abs(rows[0]), (0, 1))
+
+
+def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Record) -> Solution:
+    raise NotImplementedError
