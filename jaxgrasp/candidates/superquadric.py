@@ -52,7 +52,8 @@ def sample_grasps(
     """Samples grasps with a thumb and three fingers that face it across the object.
 
     The thumb's direction from the centre is uniform on the sphere; those of the three fingers are its opposite plus a
-    normally distributed vector of standard deviation `spread` per axis. About half of the default ones close by force.
+    normally distributed vector of standard deviation `spread` per axis. About two thirds of the default
+    ones are force closures.
 
     Args:
         count: How many.

@@ -1,0 +1,5 @@
+"""The command `jaxgrasp`, one file a subcommand."""
+
+from jaxgrasp.cli.main import main
+
+__all__ = ["main"]

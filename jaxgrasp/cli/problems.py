@@ -1,0 +1,38 @@
+"""What can be found wrong with a command line before any long work."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+
+class CommandError(Exception):
+    """Something that the caller can mend, in one line."""
+
+    exit_code = 2
+
+
+def check_output(path: Path, option: str, endings: Sequence[str], inputs: Sequence[Path]) -> None:
+    """Finds out whether a file can be written, and leaves everything as it was.
+
+    Args:
+        path: The file.
+        option: The option that names it.
+        endings: The endings that say a known format.
+        inputs: Files that must not be overwritten.
+
+    Raises:
+        CommandError: The ending is unknown, the file is one of the inputs, or it cannot be written.
+    """
+    if path.suffix not in endings:
+        raise CommandError(f"{option} {path}: got the ending {path.suffix!r}; wanted one of {', '.join(endings)}")
+    if any(path.resolve() == other.resolve() for other in inputs):
+        raise CommandError(f"{option} {path}: this file is read from; wanted another one")
+    existed = path.exists()
+    try:
+        # Permissions of the file's folder say little about read-only, full or remote ones: only opening it tells.
+        with path.open("ab"):
+            pass
+        if not existed:
+            os.unlink(path)
+    except OSError as error:
+        raise CommandError(f"{option} {path}: cannot be written ({(error.strerror or str(error)).lower()})") from error

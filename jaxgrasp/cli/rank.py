@@ -1,0 +1,194 @@
+"""`jaxgrasp rank`: files of candidates in, a table and a figure out."""
+
+import math
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from jaxgrasp.cli.problems import CommandError, check_output
+
+if TYPE_CHECKING:
+    from jaxgrasp.candidates import Candidates
+    from jaxgrasp.disturbance import DisturbanceSet
+    from jaxgrasp.ranking import Ranking
+
+TABLE_ENDINGS = (".parquet", ".csv", ".npz")
+FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+BOX = (1.0, 1.0, 1.0, 0.02, 0.02, 0.02)
+SAMPLED = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rank:
+    """Rank candidate grasps by the largest disturbance that they resist.
+
+    Reads .npz files with positions (N, n_c, 3), in m about the centre of mass, and outward_normals (N, n_c, 3) or
+    frames (N, n_c, 3, 3), and where present friction, max_force, mass, center_of_mass and active; other columns travel
+    along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object.
+    """
+
+    files: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Files of candidates; none for the built-in object."""
+
+    friction: float | None = None
+    """Coulomb's friction coefficient for files without any."""
+
+    max_force: float | None = None
+    """Largest normal force for files without any, N."""
+
+    gravity: float = 0.0
+    """Gravity along the object's -z, m/s^2, under which the mass of each candidate must be borne; 0 for none."""
+
+    disturbances: str = "forces"
+    """forces: 1 N along the six axes; ball: 1 N in any direction; box: 1 N along each axis together with 0.02 N m about
+    each; or a FILE of wrenches, .npy or .npz with the field wrenches (n_d, 6), N and N m. The margin is the factor by
+    which they may grow."""
+
+    cone_edges: int = 8
+    """Edges of the friction pyramid."""
+
+    share: float = 0.75
+    """The part of its margin for which the tightening forces of a grasp are found."""
+
+    top: int = 10
+    """How many of the best get tightening forces."""
+
+    output: Path | None = Path("ranking.parquet")
+    """The table to write, .parquet, .csv or .npz; None for no table."""
+
+    figure: Path | None = Path("ranking.png")
+    """The figure to write, .png, .svg or .pdf; None for no figure."""
+
+    def run(self) -> int:
+        """Ranks, writes and prints.
+
+        Returns:
+            The exit code: 0, 130 after Ctrl-C, 1 after an error of the computation, 2 where a file could not be written
+            in the end.
+
+        Raises:
+            CommandError: The options or the files cannot be used.
+        """
+        self._check()
+        _configure_jax()
+        from jaxgrasp.candidates import CandidateError
+
+        try:
+            candidates = self._candidates()
+            disturbances, unit = self._disturbances()
+        except CandidateError as error:
+            raise CommandError(str(error)) from error
+        return self._rank(candidates, disturbances, unit)
+
+    def _check(self) -> None:
+        checks = [
+            ("--friction", self.friction, self.friction is None or 0.0 <= self.friction < math.inf, "a number >= 0"),
+            ("--max-force", self.max_force, self.max_force is None or 0.0 < self.max_force < math.inf, "newtons > 0"),
+            ("--gravity", self.gravity, math.isfinite(self.gravity), "a finite number of m/s^2"),
+            ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
+            ("--share", self.share, 0.0 < self.share <= 1.0, "a number in (0, 1]"),
+            ("--top", self.top, self.top >= 0, "a number >= 0"),
+        ]
+        for option, value, admissible, wanted in checks:
+            if not admissible:
+                raise CommandError(f"{option}: got {value}; wanted {wanted}")
+        inputs = [*self.files, Path(self.disturbances)]
+        for option, path, endings in (
+            ("--output", self.output, TABLE_ENDINGS),
+            ("--figure", self.figure, FIGURE_ENDINGS),
+        ):
+            if path is not None:
+                check_output(path, option, endings, inputs)
+
+    def _candidates(self) -> "Candidates":
+        from jaxgrasp.candidates import read_candidates, sample_grasps
+
+        if self.files:
+            return read_candidates(
+                self.files, friction=self.friction, max_force=self.max_force, with_mass=self.gravity != 0.0
+            )
+        return sample_grasps(
+            SAMPLED,
+            friction=0.6 if self.friction is None else self.friction,
+            max_force=10.0 if self.max_force is None else self.max_force,
+        )
+
+    def _disturbances(self) -> "tuple[DisturbanceSet, str]":
+        import jax.numpy as jnp
+
+        from jaxgrasp.candidates import read_wrenches
+        from jaxgrasp.disturbance import DisturbanceSet
+
+        if self.disturbances == "forces":
+            return DisturbanceSet.forces(1.0), "N"
+        if self.disturbances == "ball":
+            return DisturbanceSet.ball(force=1.0), "N"
+        if self.disturbances == "box":
+            return DisturbanceSet.box(jnp.array(BOX)), "boxes"
+        return DisturbanceSet.vertices(jnp.asarray(read_wrenches(self.disturbances))), "times the file's"
+
+    def _rank(self, candidates: "Candidates", disturbances: "DisturbanceSet", unit: str) -> int:
+        from jaxgrasp.cli.report import Clock, print_ranking, progress_bar
+        from jaxgrasp.ranking import RankingInterrupted, rank
+
+        clock = Clock()
+        exit_code = 0
+        try:
+            with progress_bar(len(candidates), clock) as progress:
+                ranking = rank(
+                    candidates,
+                    disturbances,
+                    gravity=self.gravity,
+                    cone_edges=self.cone_edges,
+                    share=self.share,
+                    top=self.top,
+                    progress=progress,
+                )
+        except RankingInterrupted as interruption:
+            ranking, reason = interruption.ranking, interruption.__cause__
+            exit_code = 130 if isinstance(reason, KeyboardInterrupt) else 1
+            what = "interrupted" if exit_code == 130 else " ".join(str(reason).split()) or type(reason).__name__
+            print(f"jaxgrasp: {what}: ranked {len(ranking.margin):,} of {len(candidates):,}", file=sys.stderr)
+            if len(ranking.margin) == 0:
+                return exit_code
+        written, failed = self._write(ranking, unit)
+        print_ranking(ranking, unit, clock, written)
+        return exit_code or (2 if failed else 0)
+
+    def _write(self, ranking: "Ranking", unit: str) -> tuple[list[Path], bool]:
+        from jaxgrasp.ranking import write_table
+        from jaxgrasp.viewer import figure_of_ranking, write_figure
+
+        written, failed = [], False
+        for path, write in (
+            (self.output, lambda path: write_table(ranking, path)),
+            (
+                self.figure,
+                lambda path: write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity)), path),
+            ),
+        ):
+            if path is None:
+                continue
+            try:
+                write(path)
+                written.append(path)
+            except OSError as error:
+                print(f"jaxgrasp: {path}: cannot be written ({error.strerror or error})", file=sys.stderr)
+                failed = True
+        return written, failed
+
+
+def _configure_jax() -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    try:
+        # One program runs on one core; as many devices as cores make a tile run on all of them.
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+    except RuntimeError:
+        # Whoever calls the command from a program of their own has started JAX already: its devices stay as they are.
+        pass

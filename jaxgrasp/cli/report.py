@@ -1,0 +1,121 @@
+"""What a ranking prints: its best, a count of every status, how fast it went and what was written."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from jaxgrasp.ranking import Ranking
+from jaxgrasp.solvers.status import Status
+
+_ROWS = 20
+_TEXT_COLUMNS = 2
+_PLAIN_WIDTH = 160
+
+
+class Clock:
+    """Keeps apart the first tile, whose time is mostly compilation, from those that follow."""
+
+    def __init__(self) -> None:
+        """Starts."""
+        self.start = time.perf_counter()
+        self.ticks: list[tuple[float, int]] = []
+
+    def tick(self, done: int) -> None:
+        """Notes that so many candidates are done."""
+        self.ticks.append((time.perf_counter(), done))
+
+    def __str__(self) -> str:
+        """Returns how long it took and, where more than one tile was solved, how many a second after the first."""
+        (first, before), (last, done) = self.ticks[0], self.ticks[-1]
+        text = f"{done:,} candidates in {last - self.start:.1f} s, compilation included"
+        if len(self.ticks) > 1:
+            text += f"; {(done - before) / (last - first):,.0f} a second once compiled"
+        return text
+
+
+@contextlib.contextmanager
+def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
+    """Shows a bar on standard error where that is a terminal.
+
+    Args:
+        total: How many candidates there are.
+        clock: Ticks with the bar.
+
+    Yields:
+        What to call with the number of candidates done.
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("compiling", total=total)
+
+        def show(done: int) -> None:
+            clock.tick(done)
+            progress.update(task, completed=done, description="ranking" if done < total else "tightening")
+
+        yield show
+
+
+def print_ranking(ranking: Ranking, unit: str, clock: Clock, written: Sequence[Path]) -> None:
+    """Prints a ranking to standard output.
+
+    Args:
+        ranking: The ranking.
+        unit: Unit of the margin.
+        clock: How long it took.
+        written: The files that were written.
+    """
+    # Without a terminal rich would assume 80 columns and cut names short.
+    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
+    rows = min(len(ranking.forces), _ROWS)
+    if rows:
+        console.print(_table(ranking, rows, unit))
+    if rows < len(ranking.forces):
+        console.print(f"... and {len(ranking.forces) - rows} more with forces")
+    unanswered = int((ranking.tightening_status != Status.SOLVED).sum())
+    if unanswered:
+        console.print(f"no tightening forces for {unanswered} of the best {len(ranking.forces)}")
+    console.print(_counts(ranking))
+    console.print(str(clock))
+    if written:
+        console.print("written: " + ", ".join(map(str, written)), markup=False)
+
+
+def _table(ranking: Ranking, rows: int, unit: str) -> Table:
+    candidates = ranking.candidates
+    texts = [name for name, column in candidates.columns.items() if column.dtype.kind == "U" and column.ndim == 1]
+    table = Table(title=f"The best {rows} of {len(ranking.margin):,}; forces for {ranking.share:.0%} of the margin")
+    texts = texts[:_TEXT_COLUMNS]
+    numbers = (f"margin [{unit}]", "upper bound", "largest normal force [N]", "effort [N²]")
+    for name in ("rank", "grasp", *texts, *numbers[:2], "status", *numbers[2:]):
+        table.add_column(escape(name), justify="right" if name == "rank" or name in numbers else "left")
+    for place, row in enumerate(ranking.order[:rows]):
+        source = Path(candidates.sources[candidates.source[row]]).name
+        normal = -np.where(candidates.active[row], ranking.forces[place, :, 2], 0.0).min()
+        table.add_row(
+            str(place + 1),
+            escape(f"{source}:{candidates.index[row]}"),
+            *(escape(str(candidates.columns[name][row])) for name in texts),
+            f"{ranking.margin[row]:.4g}",
+            f"{ranking.upper_bound[row]:.4g}",
+            Status(int(ranking.status[row])).name,
+            f"{normal:.4g}",
+            f"{ranking.effort[place]:.4g}",
+        )
+    return table
+
+
+def _counts(ranking: Ranking) -> str:
+    counts = {status: int((ranking.status == status).sum()) for status in Status}
+    positive = int(((ranking.status == Status.SOLVED) & (ranking.margin > 1e-6)).sum())
+    parts = [f"{count:,} {status.name}" for status, count in counts.items()]
+    parts[0] += f" ({positive:,} with a margin above zero)"
+    return ", ".join(parts)

@@ -1,0 +1,176 @@
+"""The ranking of many candidates by their robustness margin, with the tightening forces of the best."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxgrasp.candidates import Candidates
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.ranking.tiles import columns_of, margins, solve_in_tiles, tightening
+from jaxgrasp.solvers.status import Status
+
+_ANSWERED = (Status.SOLVED, Status.UNBOUNDED)
+_LAST = {Status.INFEASIBLE: 2, Status.INVALID_INPUT: 3}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranking:
+    """Candidates with their margins and their order. Arrays over all N are in the candidates' order, not the ranks'."""
+
+    candidates: Candidates
+    """What was ranked; where the ranking was cut short, as many as it reached."""
+
+    margin: Float[np.ndarray, " batch"]
+    """lambda of (21), a certified lower bound: the factor by which the disturbances may be scaled; NaN without one."""
+
+    upper_bound: Float[np.ndarray, " batch"]
+    """A certified upper bound of lambda."""
+
+    status: Int[np.ndarray, " batch"]
+    """`Status` of (21)."""
+
+    order: Int[np.ndarray, " batch"]
+    """Candidates, the best first: SOLVED and UNBOUNDED by falling margin, then MAX_ITERATIONS and ILL_CONDITIONED,
+    INFEASIBLE and INVALID_INPUT, each by falling margin with NaN last; equals by their number."""
+
+    share: float
+    """The part of the margin that the tightening forces below are found for."""
+
+    forces: Float[np.ndarray, "top contacts 3"]
+    """f_0 of (22) in contact frames for `order[:top]`, N; NaN where there is no answer."""
+
+    object_forces: Float[np.ndarray, "top contacts 3"]
+    """The same in the object frame."""
+
+    effort: Float[np.ndarray, " top"]
+    """1/2 f_0' f_0 of the same, N^2."""
+
+    tightening_status: Int[np.ndarray, " top"]
+    """`Status` of (22)."""
+
+    @property
+    def rank(self) -> Int[np.ndarray, " batch"]:
+        """The rank of each candidate; 1 is the best."""
+        rank = np.empty(len(self.order), dtype=np.int64)
+        rank[self.order] = np.arange(1, len(self.order) + 1)
+        return rank
+
+
+class RankingInterrupted(Exception):
+    """Ctrl-C or an error of the device cut the ranking short; `__cause__` is what did."""
+
+    def __init__(self, ranking: Ranking):
+        """Keeps what was ranked before.
+
+        Args:
+            ranking: The candidates that were reached, without tightening forces.
+        """
+        super().__init__(f"the ranking was cut short after {len(ranking.margin)} candidates")
+        self.ranking = ranking
+
+
+def rank(
+    candidates: Candidates,
+    disturbances: DisturbanceSet | None = None,
+    *,
+    gravity: float = 0.0,
+    cone_edges: int = 8,
+    share: float = 0.75,
+    top: int = 10,
+    tile: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Ranking:
+    """Ranks candidates by the largest disturbance that they resist: (21) for all, then (22) for the best.
+
+    Works through tiles of bounded memory, each spread over the local devices, in the precision that JAX is set to.
+
+    Args:
+        candidates: What to rank.
+        disturbances: The set that the margin scales; the six forces of 1 N where None, so that margins are in N.
+        gravity: m/s^2 along the object's -z, for which the candidates' masses must be borne; zero for none.
+        cone_edges: Edges of the friction pyramid, at least 3.
+        share: The part of its margin, in (0, 1], for which the tightening forces of a candidate are found.
+        top: How many of the best get tightening forces.
+        tile: Candidates at a time, at most; None chooses by platform.
+        progress: Called after each tile of (21) with the number of candidates done.
+
+    Returns:
+        The ranking.
+
+    Raises:
+        ValueError: `share` is not in (0, 1] or `top` is negative.
+        RankingInterrupted: Ctrl-C or an error of the device; it holds what was ranked before.
+
+    Status:
+        One each for (21) and, for the best, (22). A bad candidate costs no other one anything.
+    """
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"share: got {share}; wanted a number in (0, 1]")
+    if top < 0:
+        raise ValueError(f"top: got {top}; wanted a number that is not negative")
+    if disturbances is None:
+        disturbances = DisturbanceSet.forces(1.0)
+    scores = _Scores.none(len(candidates))
+    columns = columns_of(candidates)
+    settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": tile}
+    try:
+        for rows, answer in solve_in_tiles(margins, columns, disturbances, **settings):
+            scores.fill(rows, *answer)
+            if progress is not None:
+                progress(scores.done)
+        best = scores.order()[:top]
+        columns = {name: column[best] for name, column in columns.items()} | {"wanted": share * scores.bearable(best)}
+        answers = [answer for _, answer in solve_in_tiles(tightening, columns, disturbances, **settings)]
+    except (KeyboardInterrupt, RuntimeError, MemoryError) as reason:
+        raise RankingInterrupted(scores.ranking(candidates, share, [])) from reason
+    return scores.ranking(candidates, share, answers)
+
+
+@dataclass(kw_only=True)
+class _Scores:
+    """What (21) has answered so far."""
+
+    margin: np.ndarray
+    upper_bound: np.ndarray
+    status: np.ndarray
+    done: int
+
+    @staticmethod
+    def none(count: int) -> "_Scores":
+        return _Scores(margin=np.empty(count), upper_bound=np.empty(count), status=np.empty(count, dtype=int), done=0)
+
+    def fill(self, rows: slice, margin: np.ndarray, upper_bound: np.ndarray, status: np.ndarray) -> None:
+        self.margin[rows], self.upper_bound[rows], self.status[rows] = margin, upper_bound, status
+        self.done = rows.stop
+
+    def order(self) -> np.ndarray:
+        margin, status = self.margin[: self.done], self.status[: self.done]
+        group = np.ones(self.done, dtype=int)
+        group[np.isin(status, _ANSWERED)] = 0
+        for code, last in _LAST.items():
+            group[status == code] = last
+        return np.lexsort((np.where(np.isnan(margin), np.inf, -margin), group))  # stable: equals stay in order
+
+    def bearable(self, rows: np.ndarray) -> np.ndarray:
+        # An infinite margin says that nothing disturbs the grasp: what remains to be asked is that it bears its load.
+        margin = np.where(self.status[rows] == Status.UNBOUNDED, 0.0, np.maximum(self.margin[rows], 0.0))
+        return np.where(np.isin(self.status[rows], _ANSWERED), margin, np.nan)
+
+    def ranking(self, candidates: Candidates, share: float, answers: list[tuple[np.ndarray, ...]]) -> Ranking:
+        empty = np.empty((0, candidates.num_contacts, 3))
+        answers = [(empty, empty, np.empty(0), np.empty(0, dtype=int)), *answers]
+        forces, object_forces, effort, tightening_status = map(np.concatenate, zip(*answers, strict=True))
+        return Ranking(
+            candidates=candidates.take(slice(self.done)),
+            margin=self.margin[: self.done],
+            upper_bound=self.upper_bound[: self.done],
+            status=self.status[: self.done],
+            order=self.order(),
+            share=share,
+            forces=forces,
+            object_forces=object_forces,
+            effort=effort,
+            tightening_status=tightening_status,
+        )

@@ -1,0 +1,121 @@
+"""Solves for many candidates in tiles of bounded memory, each spread over the devices of this process."""
+
+import functools
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array
+
+from jaxgrasp.candidates import Candidates
+from jaxgrasp.contact import Contacts, required_wrench
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness import largest_disturbance, least_effort
+
+# Candidates a tile: enough to keep each core busy for tens of milliseconds, few enough that a tile's arrays stay below
+# some tens of megabytes. Accelerators want more at once.
+TILE = {"cpu": 8192}
+ACCELERATOR_TILE = 131_072
+
+Columns = dict[str, np.ndarray]
+
+
+def columns_of(candidates: Candidates) -> Columns:
+    """Gathers what the programs need of each candidate.
+
+    A negative mass becomes NaN, so that it is this candidate's own INVALID_INPUT.
+    """
+    columns = {
+        "positions": candidates.positions,
+        "friction": candidates.friction,
+        "max_force": candidates.max_force,
+        "active": candidates.active,
+        "mass": np.where(candidates.mass >= 0.0, candidates.mass, np.nan),
+    }
+    if candidates.frames is not None:
+        columns["frames"] = candidates.frames
+    if candidates.outward_normals is not None:
+        columns["outward_normals"] = candidates.outward_normals
+    return columns
+
+
+def solve_in_tiles(
+    solver: Callable[..., Any],
+    columns: Columns,
+    disturbances: DisturbanceSet,
+    *,
+    gravity: float,
+    cone_edges: int,
+    tile: int | None,
+) -> Iterator[tuple[slice, Any]]:
+    """Runs a solver over all candidates, one tile after the other with one compilation.
+
+    Args:
+        solver: `margins` or `tightening`.
+        columns: What it needs of each candidate, with a leading axis of N.
+        disturbances: The set, the same for all.
+        gravity: Along the object's -z, m/s^2; zero means that nothing need be borne.
+        cone_edges: Edges of the friction pyramid.
+        tile: Candidates at a time, at most; None chooses by platform.
+
+    Yields:
+        The rows of each tile and the solver's answer for them, in NumPy.
+    """
+    mesh = Mesh(np.array(jax.local_devices()), ("candidates",))
+    count = len(columns["positions"])
+    tile = tile or TILE.get(jax.default_backend(), ACCELERATOR_TILE)
+    # Tiles of equal size waste less than a last one that is mostly padding.
+    tiles = max(1, math.ceil(count / tile))
+    size = math.ceil(count / tiles / mesh.size) * mesh.size
+    for start in range(0, count, max(size, 1)):
+        stop = min(start + size, count)
+        padded = {name: _padded(column[start:stop], size) for name, column in columns.items()}
+        answer = _solve_tile(padded, disturbances, gravity, solver, cone_edges, gravity != 0.0, mesh)
+        yield slice(start, stop), jax.tree.map(lambda leaf, n=stop - start: np.asarray(leaf)[:n], answer)
+
+
+def margins(contacts: Contacts, disturbances: DisturbanceSet, load: Array | None, cone_edges: int, _: Any) -> Any:
+    """Solves (21): margin, upper bound, status."""
+    solution = largest_disturbance(contacts, disturbances, required_wrench=load, cone_edges=cone_edges)
+    return solution.margin, solution.upper_bound, solution.status
+
+
+def tightening(
+    contacts: Contacts, disturbances: DisturbanceSet, load: Array | None, cone_edges: int, columns: Any
+) -> Any:
+    """Solves (22) at the margins of the column `wanted`: forces in contact and in object frames, effort, status."""
+    solution = least_effort(contacts, disturbances, columns["wanted"], required_wrench=load, cone_edges=cone_edges)
+    return solution.forces, solution.forces_in_object_frame(contacts), solution.effort, solution.status
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
+def _solve_tile(
+    columns: Any, disturbances: DisturbanceSet, gravity: Any, solver: Any, cone_edges: int, loaded: bool, mesh: Mesh
+) -> Any:
+    def on_one_device(columns: Any, disturbances: DisturbanceSet, gravity: Any) -> Any:
+        make = Contacts.from_frames if "frames" in columns else Contacts.from_normals
+        contacts = make(
+            columns["positions"],
+            columns["frames"] if "frames" in columns else columns["outward_normals"],
+            friction=columns["friction"],
+            max_force=columns["max_force"],
+            active=columns["active"],
+        )
+        load = None
+        if loaded:
+            load = required_wrench(columns["mass"], gravity=jnp.array([0.0, 0.0, -1.0]) * gravity)
+        return solver(contacts, disturbances, load, cone_edges, columns)
+
+    spread = jax.shard_map(
+        on_one_device, mesh=mesh, in_specs=(P("candidates"), P(), P()), out_specs=P("candidates"), check_vma=False
+    )
+    return spread(columns, disturbances, gravity)
+
+
+def _padded(column: np.ndarray, size: int) -> np.ndarray:
+    return np.pad(column, [(0, size - len(column))] + [(0, 0)] * (column.ndim - 1), mode="edge")

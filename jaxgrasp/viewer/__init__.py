@@ -1,0 +1,6 @@
+"""Figures of grasps and rankings, made with matplotlib and no window."""
+
+from jaxgrasp.viewer.grasp import draw_grasp
+from jaxgrasp.viewer.ranking import figure_of_ranking, write_figure
+
+__all__ = ["draw_grasp", "figure_of_ranking", "write_figure"]

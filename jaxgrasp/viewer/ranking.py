@@ -1,0 +1,157 @@
+"""The figure of a ranking: how the margins are distributed, and what the best grasps look like."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from jaxgrasp.ranking import Ranking
+from jaxgrasp.solvers.status import Status
+from jaxgrasp.viewer.grasp import CONTACT_COLOURS, draw_grasp
+
+# A margin below this, in multiples of the disturbance set, is drawn as none: the solver's own tolerance.
+_NOTHING = 1e-6
+_SURFACE_POINTS = 1500
+
+
+def figure_of_ranking(ranking: Ranking, *, unit: str = "N", loaded: bool = False, grasps: int = 4) -> Figure:
+    """Draws the distribution of the margins and the best grasps with their tightening forces.
+
+    Where the candidates have a column `object_name`, the contacts of all candidates on the same object are drawn as
+    dots that hint at its surface.
+
+    Args:
+        ranking: The ranking.
+        unit: Unit of the margin: "N" where the disturbances are forces of 1 N.
+        loaded: Whether a weight along -z was to be borne; it is then drawn.
+        grasps: How many of the best that have forces to draw, at most.
+
+    Returns:
+        The figure; `savefig` writes it.
+    """
+    shown = np.flatnonzero(np.isfinite(ranking.effort))[:grasps].tolist()
+    figure = Figure(figsize=(13.0, 7.6) if shown else (5.0, 6.0), layout=ConstrainedLayoutEngine(hspace=0.06), dpi=150)
+    if not shown:
+        _draw_distribution(figure.subplots(2, 1, height_ratios=(3, 1)), ranking, unit)
+        return figure
+    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.9), squeeze=False).flat
+    _draw_distribution(left.subplots(2, 1, height_ratios=(3, 1)), ranking, unit)
+    columns = min(len(shown), 2)
+    for number, place in enumerate(shown, start=1):
+        # Added one by one: matplotlib cannot lay out a 3D panel that is there and not visible.
+        panel = right.add_subplot(-(-len(shown) // columns), columns, number, projection="3d", proj_type="ortho")
+        _draw_panel(panel, ranking, place, unit, loaded)
+    right.legend(handles=_legend(loaded), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    return figure
+
+
+def write_figure(figure: Figure, path: Path | str) -> None:
+    """Writes a figure, in place of an older file only once it is whole.
+
+    Args:
+        figure: The figure.
+        path: The file; its ending says the format (png, svg, pdf ...).
+
+    Raises:
+        ValueError: The ending says no format that matplotlib knows.
+        OSError: The file cannot be written.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        figure.savefig(part, format=path.suffix.removeprefix("."))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _draw_distribution(axes: np.ndarray, ranking: Ranking, unit: str) -> None:
+    histogram, counts = axes
+    outcomes = _outcomes(ranking)
+    positive = ranking.margin[outcomes["margin > 0"]]
+    if len(positive):
+        histogram.hist(positive, bins=min(60, max(10, int(len(positive) ** 0.5))), color="#4477aa", linewidth=0)
+        best = ranking.margin[ranking.order[: len(ranking.forces)]]
+        best = best[np.isfinite(best)]
+        if len(best):
+            label = "the best one" if len(best) == 1 else f"the best {len(best)}"
+            histogram.plot(best, np.zeros(len(best)), "|", color="#cc3311", markersize=14, label=label)
+        histogram.axvline(np.median(positive), color="0.2", linewidth=1.0, linestyle="--", label="median")
+        histogram.legend(frameon=False, fontsize=8)
+        histogram.set_xlim(left=0.0)
+    else:
+        histogram.text(0.5, 0.5, "no candidate resists\nevery disturbance", ha="center", transform=histogram.transAxes)
+    histogram.set(xlabel=f"robustness margin $\\lambda$ [{unit}]", ylabel="candidates")
+    histogram.set_title("Candidates with a positive margin", fontsize=10)
+    _draw_counts(counts, {name: int(mask.sum()) for name, mask in outcomes.items() if mask.any()})
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+
+
+def _outcomes(ranking: Ranking) -> dict[str, Bool[np.ndarray, " batch"]]:
+    solved = ranking.status == Status.SOLVED
+    positive = ranking.margin > _NOTHING
+    outcomes = {"margin > 0": solved & positive, "margin 0": solved & ~positive}
+    others = [status for status in Status if status != Status.SOLVED]
+    return outcomes | {status.name.lower().replace("_", " "): ranking.status == status for status in others}
+
+
+def _draw_counts(axes: Axes, counts: dict[str, int]) -> None:
+    names = list(counts)[::-1]
+    bars = axes.barh(names, [counts[name] for name in names], color="#4477aa", height=0.6)
+    axes.bar_label(bars, labels=[f"{counts[name]:,}" for name in names], padding=3, fontsize=8)
+    axes.set(xlabel="candidates", xlim=(0.0, 1.25 * max(counts.values())))
+    axes.set_title("All candidates by outcome", fontsize=10)
+    axes.locator_params(axis="x", nbins=4)
+    axes.tick_params(labelsize=8)
+
+
+def _draw_panel(panel: Any, ranking: Ranking, place: int, unit: str, loaded: bool) -> None:
+    candidates, row = ranking.candidates, ranking.order[place]
+    scale = draw_grasp(
+        panel,
+        candidates.positions[row],
+        candidates.normals[row],
+        ranking.object_forces[place],
+        friction=candidates.friction[row],
+        active=candidates.active[row],
+        load=np.array([0.0, 0.0, -1.0]) if loaded else None,
+        surface=_surface(ranking, row),
+    )
+    source = Path(candidates.sources[candidates.source[row]]).stem
+    name = candidates.columns["object_name"][row] if "object_name" in candidates.columns else source
+    margin = f"{ranking.margin[row]:.3g}" if np.isfinite(ranking.margin[row]) else r"\infty"
+    title = f"#{place + 1}: {name}, candidate {candidates.index[row]}\n$\\lambda = {margin}$ {unit}"
+    panel.set_title(
+        f"{title}; arrows: 1 mm = {scale:.2g} N" if np.isfinite(scale) else f"{title}; no forces", fontsize=9, y=1.02
+    )
+
+
+def _surface(ranking: Ranking, row: int) -> np.ndarray | None:
+    candidates = ranking.candidates
+    if "object_name" not in candidates.columns:
+        return None
+    same = candidates.columns["object_name"] == candidates.columns["object_name"][row]
+    rows = np.flatnonzero(same)[: _SURFACE_POINTS // candidates.num_contacts]
+    points = candidates.positions[rows][candidates.active[rows]]
+    return points[np.isfinite(points).all(axis=-1)]
+
+
+def _legend(loaded: bool) -> list[Line2D | Patch]:
+    colour = CONTACT_COLOURS[0]
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=colour, marker=">", linewidth=2.0, label="tightening force on the object"),
+        Patch(facecolor=(*to_rgb(colour), 0.15), edgecolor=colour, label="friction cone"),
+        Line2D([], [], color="0.25", linestyle=(0, (3, 2)), label="outward normal"),
+        Line2D([], [], color="black", marker="+", linestyle="none", label="centre of mass"),
+    ]
+    if loaded:
+        handles.append(Line2D([], [], color="black", marker=">", linewidth=2.0, label="weight"))
+    return handles
