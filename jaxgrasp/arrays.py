@@ -3,8 +3,11 @@
 Shapes are written batch first: `*batch` is any number of leading axes. Inside kernels the batch is one trailing axis, "lanes".
 """
 
+from collections.abc import Callable, Iterable
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 
@@ -29,6 +32,13 @@ def as_float(name: str, value: ArrayLike, event: tuple[int | str, ...]) -> jax.A
         wanted = ", ".join(["*batch", *map(str, event)])
         raise ValueError(f"{name}: got shape {array.shape}, wanted ({wanted})")
     return array
+
+
+def literal(values: np.ndarray, dtype: jnp.dtype) -> jax.Array:
+    """A small constant array spelt out in the program; JAX would hand a NumPy array to the compiled program as one more argument."""
+    if values.ndim == 0:
+        return jnp.full((), float(values), dtype)
+    return jnp.stack([literal(v, dtype) for v in values])
 
 
 def broadcast_batch(**batches: tuple[int, ...]) -> tuple[int, ...]:
@@ -85,3 +95,14 @@ def frames_from_normals(normals: jax.Array) -> jax.Array:
     t2 = jnp.stack([-x * y * inverse, 1 - y * y * inverse, -y], -1)
     frames = jnp.stack([t1, t2, n], -1)
     return jnp.where(jnp.isfinite(n)[..., None, :].all(-1, keepdims=True), frames, jnp.nan)
+
+
+def fold(op: Callable[[jax.Array, jax.Array], jax.Array], parts: Iterable[jax.Array]) -> jax.Array:
+    """Combine arrays, or the entries along a leading axis, with a binary operation, pairwise.
+
+    Spelt out, where a reduction would do: XLA's CPU code for it then runs along the trailing lanes, in full vectors.
+    """
+    parts = list(parts)
+    while len(parts) > 1:
+        parts = [op(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i] for i in range(0, len(parts), 2)]
+    return parts[0]

@@ -41,3 +41,8 @@ def fenced(function: Callable[P, T]) -> Callable[P, T]:
             return jax.jit(function)(*args, **kwargs)
 
     return wrapped
+
+
+def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
+    """`step(i, state)` for i = 0 .. count - 1: a loop where fences are on, where code size is compile time; else spelt out, for fusion."""
+    return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() else True)

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import as_float
-from jaxgrasp.fence import fenced
+from jaxgrasp.arrays import as_float, fold
+from jaxgrasp.fence import fenced, repeat
 
 RANK_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}
 
@@ -38,67 +38,57 @@ class Compliance:
 
 
 class Basis(NamedTuple):
-    """An orthonormal basis of the row space of six (or more) rows, and the row operations T that lead to it; lanes trail.
+    """An orthonormal basis of the row space of r rows, and the row operations T that lead to it; lanes trail.
 
-    rows: list of r arrays (k, n, *lanes), T times the given rows: orthonormal, or zero where dropped.
-    operations: list of r lists, T's lower triangle, arrays (*lanes); a dropped row of T is a vector that the given rows do not reach.
-    kept: list of r arrays (*lanes), 1 or 0.
-    ratios: list of r arrays (*lanes), what was left of each row, in lengths of the longest row.
+    rows: (r, k, n, *lanes), T times the given rows: orthonormal, or zero where dropped.
+    operations: (r, r, *lanes), T, lower triangular; a dropped row of T is a vector that the given rows do not reach.
+    kept: (r, *lanes), 1 or 0.
+    ratios: (r, *lanes), what was left of each row, in lengths of the longest row.
     """
 
-    rows: list
-    operations: list
-    kept: list
-    ratios: list
+    rows: jax.Array
+    operations: jax.Array
+    kept: jax.Array
+    ratios: jax.Array
 
-    @property
-    def rank(self) -> jax.Array:
-        """Number of rows kept."""
-        return sum(self.kept[1:], self.kept[0])
-
-    def coordinates(self, wrench: jax.Array) -> list[jax.Array]:
+    def coordinates(self, wrench: jax.Array) -> jax.Array:
         """T w for w (r, *lanes): coordinates in the basis where kept, what lies outside the range where dropped."""
-        return [_combine(row, wrench) for row in self.operations]
+        return fold(jnp.add, [self.operations[:, c] * wrench[c] for c in range(wrench.shape[0])])
 
 
-def row_basis(rows: list[jax.Array]) -> Basis:
-    """Gram-Schmidt with re-orthogonalisation of rows (k, n, *lanes).
+def row_basis(rows: jax.Array) -> Basis:
+    """Modified Gram-Schmidt of rows (r, k, n, *lanes), twice: the second sweep makes the basis orthonormal to rounding, however close the rows were.
 
-    Two passes of the classical process leave the basis orthonormal to rounding whatever the condition of the rows.
+    Rows that end up shorter than the tolerance become zero, and their operations stay unscaled.
     """
-    longest = fenced(lambda rows: jnp.sqrt(_largest([_dot(r, r) for r in rows])))(rows)
-    tolerance = RANK_TOLERANCE[rows[0].dtype.name]
-    basis, operations, kept, ratios = [], [], [], []
+    count, lanes = rows.shape[0], rows.shape[3:]
+    index = jnp.arange(count).reshape(count, *[1] * len(lanes))
+    eye = jnp.eye(count, dtype=rows.dtype).reshape(count, count, *[1] * len(lanes))
+    longest = jnp.sqrt(fold(jnp.maximum, _dot(rows, rows)))
+    tolerance = RANK_TOLERANCE[rows.dtype.name]
 
     @fenced
-    def remove(row: jax.Array, own: list, basis: list, operations: list) -> tuple:
-        shares = [_dot(row, q) for q in basis]
-        for share, q in zip(shares, basis, strict=True):
-            row = row - share * q
-        own = list(own)
-        for share, other in zip(shares, operations, strict=True):
-            for column, entry in enumerate(other):
-                own[column] = own[column] - share * entry
-        return row, own
-
-    @fenced
-    def normalise(row: jax.Array, own: list, longest: jax.Array) -> tuple:
-        length = jnp.sqrt(_dot(row, row))
-        keep = length > tolerance * longest
+    def remove(j: jax.Array, least: jax.Array, rows: jax.Array, operations: jax.Array, products: jax.Array) -> tuple:
+        length = jnp.sqrt(products[j])
+        keep = length > least
         inverse = jnp.where(keep, 1 / jnp.where(keep, length, 1), 0)
-        own = [jnp.where(keep, entry * inverse, entry) for entry in own]
-        return row * inverse, own, keep.astype(row.dtype), length / jnp.where(longest > 0, longest, 1)
+        own, later = index == j, index > j
+        share = jnp.where(later, products * (inverse * inverse), 0)[:, None]
+        turned = jnp.where(own[:, None], operations * jnp.where(keep, inverse, 1), operations - share * operations[j])
+        return jnp.where(own[:, None, None], rows * inverse, rows - share[:, None] * rows[j]), turned, length
 
-    for index, row in enumerate(rows):
-        own = [jnp.full_like(longest, float(column == index)) for column in range(index + 1)]
-        for _ in range(2 if basis else 0):
-            row, own = remove(row, own, basis, operations)
-        q, own, keep, ratio = normalise(row, own, longest)
-        basis.append(q)
-        operations.append(own)
-        kept.append(keep)
-        ratios.append(ratio)
-    return Basis(basis, operations, kept, ratios)
+    def step(i: jax.Array, state: tuple) -> tuple:
+        rows, operations, lengths = state
+        j = i % count
+        least = jnp.where(i < count, tolerance * longest, 0.5)
+        products = fenced(lambda rows, j: _dot(rows, rows[j]))(rows, j)
+        rows, operations, length = remove(j, least, rows, operations, products)
+        return rows, operations, lengths.at[i].set(length)
+
+    state = (rows, jnp.broadcast_to(eye, (count, count, *lanes)), jnp.zeros((2 * count, *lanes), rows.dtype))
+    rows, operations, lengths = repeat(2 * count, step, state)
+    kept = (lengths[count:] > 0.5).astype(rows.dtype)
+    return Basis(rows, operations, kept, lengths[:count] / jnp.where(longest > 0, longest, 1))
 
 
 def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array | None, jax.Array]:
@@ -136,20 +126,11 @@ def pseudo_inverse(columns: jax.Array, half: jax.Array | None) -> tuple[jax.Arra
     Returns:
         (3, 6, n, *lanes), blocks of G*, and the basis of the rows of G.
     """
-    basis = row_basis(list(_times_half(columns, half)))
-    rows = _half_times(jnp.stack(basis.rows), half)
-
-    @fenced
-    def assemble(rows: jax.Array, operations: list) -> jax.Array:
-        out = []
-        for wrench in range(6):
-            total = rows[wrench] * operations[wrench][wrench]
-            for r in range(wrench + 1, 6):
-                total = total + rows[r] * operations[r][wrench]
-            out.append(total)
-        return jnp.stack(out, 1)
-
-    return assemble(rows, basis.operations), basis
+    basis = row_basis(_times_half(columns, half))
+    rows = _half_times(basis.rows, half)
+    # On dropped rows the basis is zero, so what T holds there does not matter.
+    product = lambda rows, t: fold(jnp.add, [r[:, None] * o[None, :, None] for r, o in zip(rows, t, strict=True)])  # noqa: E731
+    return fenced(product)(rows, basis.operations), basis
 
 
 def _times_half(columns: jax.Array, half: jax.Array | None) -> jax.Array:
@@ -182,18 +163,5 @@ def _unflatten(rows: jax.Array) -> jax.Array:
 
 
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    return jnp.sum(a * b, (0, 1))
-
-
-def _combine(row: list, wrench: jax.Array) -> jax.Array:
-    total = row[0] * wrench[0]
-    for column in range(1, len(row)):
-        total = total + row[column] * wrench[column]
-    return total
-
-
-def _largest(values: list) -> jax.Array:
-    best = values[0]
-    for value in values[1:]:
-        best = jnp.maximum(best, value)
-    return best
+    """Inner products of rows (r, k, n, *lanes) with b, (r, *lanes)."""
+    return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(a * b, 1, 0)), 1, 0))

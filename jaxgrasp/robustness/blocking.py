@@ -31,14 +31,13 @@ def blocking_forces(
     """
 
     def kernel(grasps: Grasps) -> jax.Array:
-        w = grasps.terms[0].wrenches
-        scaled = jnp.concatenate([w[:, :3], w[:, 3:] / grasps.length], 1)
+        scaled = grasps.terms[0].wrenches * grasps.units
         if grasps.vertex_halves is None:
             inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
             forces = -jnp.einsum("aen...,de...->dna...", inverse, scaled)
         else:
             one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
-            forces = jax.lax.map(one, (grasps.vertex_halves, jnp.broadcast_to(scaled, (*w.shape[:2], *grasps.length.shape))))
+            forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
         forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
         return jnp.where(grasps.valid, forces, jnp.nan)
 

@@ -34,6 +34,8 @@ class Grasps:
     """(n, *lanes), N."""
     length: jax.Array
     """(*lanes), root-mean-square distance of the contacts from the centre of mass, m; 1 where that is zero."""
+    units: jax.Array
+    """(6, *lanes), what turns wrenches in N and N m to newtons: 1 and 1 / length."""
     columns: jax.Array
     """(6, 3, n, *lanes), the blocks of G; zero where absent."""
     wrench: jax.Array
@@ -178,6 +180,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...]) -> Grasps:
     frames = jnp.where(there, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
     mean = jnp.sum(positions**2, (0, 1)) / jnp.maximum(jnp.sum(there, 0), 1).astype(dtype)
     length = jnp.sqrt(jnp.where(mean > 0, mean, 1))
+    units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, raw["wrench"], 0)
     return Grasps(
         valid=valid,
@@ -185,8 +188,9 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...]) -> Grasps:
         friction=jnp.where(there, raw["friction"], 1),
         max_force=jnp.where(there, raw["max_force"], 1),
         length=length,
+        units=units,
         columns=grasp_columns(positions / length, frames),
-        wrench=jnp.concatenate([wrench[:3], wrench[3:] / length]),
+        wrench=wrench * units,
         reserve=jnp.where(valid, raw["reserve"], 0),
         terms=terms,
         half=half,

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, row_basis
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.fence import fenced
@@ -41,7 +42,7 @@ class Program:
     """mu F, (n, *lanes), N."""
     normal: jax.Array
     """F, (n, *lanes), N."""
-    operations: Basis
+    basis: Basis
     """Row operations from G in newtons to the orthonormal rows, for forces in units of `mean`."""
     mean: jax.Array
     """Mean of F, (*lanes), N."""
@@ -64,17 +65,14 @@ class Program:
 
     def row_units(self) -> jax.Array:
         """What one unit of every scaled row is in newtons, (n_e + 1, n, *lanes)."""
-        edges = self.blocks.patterns.shape[0] - 1
+        edges = self.blocks.sigma.shape[0] - 1
         return jnp.concatenate([jnp.broadcast_to(self.tangential, (edges, *self.tangential.shape)), self.normal[None]])
 
-    def wrench_multipliers(self, y: jax.Array, length: jax.Array) -> jax.Array:
+    def wrench_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
         """Multipliers of G f = b (6, *lanes) from those of the orthonormal rows, per unit of the scaled objective."""
-        entries = []
-        for column in range(6):
-            rows = range(column, 6)
-            entries.append(sum(self.operations.operations[r][column] * y[r] * self.operations.kept[r] for r in rows))
-        stacked = jnp.stack(entries) / self.mean
-        return jnp.concatenate([stacked[:3], stacked[3:] / length])
+        kept = self.basis.kept * y
+        terms = [self.basis.operations[r] * kept[r] for r in range(6)]
+        return fold(jnp.add, terms) / self.mean * units
 
 
 def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
@@ -101,20 +99,21 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     mean = jnp.sum(normal * present, 0) / jnp.maximum(jnp.sum(present, 0), 1)
     mean = jnp.where(mean > 0, mean, 1)
     columns = grasps.columns * (jnp.stack([tangential, tangential, normal]) / mean)
-    rows = row_basis(list(columns))
+    rows = row_basis(columns)
     wrench = grasps.wrench / mean
-    coordinates = jnp.stack(rows.coordinates(wrench))
-    kept = jnp.stack(rows.kept)
+    coordinates, kept = rows.coordinates(wrench), rows.kept
     largest = jnp.max(jnp.abs(wrench), 0)
     outside = jnp.max(jnp.abs(coordinates) * (1 - kept), 0) > 10 * RANK_TOLERANCE[dtype.name] * largest
-    facets = pyramid_facets(cone_edges)
+    patterns = np.concatenate([pyramid_facets(cone_edges), [[0.0, 0.0, -1.0]]])
     return Program(
         blocks=Blocks(
-            patterns=np.concatenate([facets, [[0.0, 0.0, -1.0]]]),
-            columns=jnp.stack(rows.rows),
+            patterns=literal(patterns, dtype),
+            columns=rows.rows,
             sigma=sigma,
             h=h,
             present=present,
+            hessian=None,
+            start=literal(np.array([0.0, 0.0, -0.6]), dtype),
         ),
         rhs=coordinates * kept,
         dropped=1 - kept,
@@ -122,9 +121,9 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         scale=scale,
         tangential=tangential,
         normal=normal,
-        operations=rows,
+        basis=rows,
         mean=mean,
-        rank=basis.rank.astype(jnp.int32),
+        rank=jnp.sum(basis.kept, 0).astype(jnp.int32),
         doubtful=_doubtful(basis),
         undisturbed=undisturbed,
         disturbance_outside=reaches_outside(grasps, basis),
@@ -135,7 +134,7 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
 
 def _doubtful(basis: Basis) -> jax.Array:
     """A row between clearly dependent and clearly independent; float64 is fine enough to decide."""
-    ratios = jnp.stack(basis.ratios)
+    ratios = basis.ratios
     if ratios.dtype == jnp.float64:
         return jnp.zeros(ratios.shape[1:], bool)
     return ((ratios > 1e-5) & (ratios < 1e-3)).any(0)

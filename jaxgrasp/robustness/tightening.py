@@ -137,7 +137,12 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     settings = _SETTINGS[dtype.name]
     problem = MarginProblem((program.blocks,), program.rhs, program.dropped, program.radius)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
-    record = outcome.record
+    # Without a load, no forces at all are an answer with margin 0, exactly.
+    idle = (outcome.record.lower < 0) & (program.rhs == 0).all(0) & (grasps.reserve == 0)
+    record = outcome.record._replace(
+        lower=jnp.where(idle, 0, outcome.record.lower),
+        x=tuple(jnp.where(idle, 0, x) for x in outcome.record.x),
+    )
     low, high = record.lower, record.upper
     size = jnp.maximum(1, jnp.abs(low))
     closed = high - low <= _ACCEPTED_GAP[dtype.name] * size
@@ -180,7 +185,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
         rank=program.rank,
         cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
         bound_multipliers=multipliers[-1],
-        wrench_multipliers=program.wrench_multipliers(record.y, grasps.length) * scale,
+        wrench_multipliers=program.wrench_multipliers(record.y, grasps.units) * scale,
     )
     return solution, record
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxgrasp.arrays import literal
 from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, Compliance, pseudo_inverse
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
@@ -52,20 +53,20 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, B
     """-S_1 (n_e, n, *lanes), S_2 (n, *lanes) and the basis of G's rows; lanes trail."""
 
     @fenced
-    def directions(inverse: jax.Array, friction: jax.Array, length: jax.Array) -> jax.Array:
+    def directions(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
         """Wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6, n, *lanes)."""
-        facets = pyramid_facets(cone_edges).tolist()
-        rows = [-(c * inverse[0] + s * inverse[1] + (k * friction) * inverse[2]) for c, s, k in facets]
-        return _scaled(jnp.stack([*rows, inverse[2]], 1), length)
+        c, s, k = literal(pyramid_facets(cone_edges).T, inverse.dtype)[:, None, :, None, None]
+        cone = -(c * inverse[0][:, None] + s * inverse[1][:, None] + (k * friction) * inverse[2][:, None])
+        return jnp.concatenate([cone, inverse[2][:, None]], 1) * units[:, None, None]
 
     inverse, basis = pseudo_inverse(grasps.columns, grasps.half)
     if grasps.vertex_halves is None:
-        reach = fenced(support)(grasps.terms, directions(inverse, grasps.friction, grasps.length))
+        reach = fenced(support)(grasps.terms, directions(inverse, grasps.friction, grasps.units))
     else:
 
         def worse(reach: jax.Array, each: tuple) -> tuple[jax.Array, None]:
             half, wrench = each
-            rows = directions(pseudo_inverse(grasps.columns, half)[0], grasps.friction, grasps.length)
+            rows = directions(pseudo_inverse(grasps.columns, half)[0], grasps.friction, grasps.units)
             return jnp.maximum(reach, jnp.sum(rows * wrench[:, None, None], 0)), None
 
         reach = jnp.zeros((cone_edges + 1, *grasps.present.shape), grasps.present.dtype)
@@ -85,18 +86,9 @@ def reaches_outside(grasps: Grasps, basis: Basis) -> jax.Array:
     tolerance = 10 * RANK_TOLERANCE[length.dtype.name]
 
     def measure() -> jax.Array:
-        size = sum(jnp.max(_scaled(term.extent(), length), 0) for term in grasps.terms)
-        vectors = []
-        for kept, row in zip(basis.kept, basis.operations, strict=True):
-            vector = jnp.stack([*row, *[jnp.zeros_like(length)] * (6 - len(row))])
-            vectors.append(jnp.where(kept > 0, 0, vector))
-        outside = _scaled(jnp.stack(vectors, 1), length)
-        reach = jnp.maximum(support(grasps.terms, outside), support(grasps.terms, -outside))
+        size = sum(jnp.max(term.extent() * grasps.units, 0) for term in grasps.terms)
+        outside = jnp.moveaxis(jnp.where(basis.kept[:, None] > 0, 0, basis.operations), 0, 1) * grasps.units[:, None]
+        reach = support(grasps.terms, jnp.concatenate([outside, -outside], 1))
         return jnp.max(reach, 0) > tolerance * size
 
-    return lax.cond(jnp.all(basis.rank == 6), lambda: jnp.zeros(lanes, bool), measure)
-
-
-def _scaled(wrenches: jax.Array, length: jax.Array) -> jax.Array:
-    """Moments, along the leading axis, divided by length; so are directions that shall weigh moments in N m."""
-    return jnp.concatenate([wrenches[:3], wrenches[3:] / length])
+    return lax.cond(jnp.all(basis.kept > 0), lambda: jnp.zeros(lanes, bool), measure)

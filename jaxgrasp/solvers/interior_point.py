@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxgrasp.fence import fenced
+from jaxgrasp.arrays import fold
+from jaxgrasp.fence import fenced, repeat
 
 Tree = Any
 
@@ -31,6 +32,7 @@ class Settings(NamedTuple):
     mu_floor: smallest complementarity that is aimed at.
     equal_steps: one step length for primal and dual unknowns (static).
     safeguard: keep s >= safeguard * mu / z and z >= safeguard * mu / s after a step (static; 0.0 switches it off).
+    patience: steps in a row that may fail to cut the gap by a tenth.
     """
 
     tolerance: float
@@ -39,6 +41,7 @@ class Settings(NamedTuple):
     mu_floor: float
     equal_steps: bool
     safeguard: float
+    patience: int = 3
 
 
 class Iterate(NamedTuple):
@@ -83,7 +86,7 @@ class Problem(Protocol):
         """Factorisation of the Newton system for weights z/s (like s)."""
         ...
 
-    def solve(self, factors: Any, weights: Tree, residuals: Residuals, shift: Tree) -> tuple[Tree, Tree, Tree]:
+    def solve(self, factors: Any, residuals: Residuals, shift: Tree) -> tuple[Tree, Tree, Tree]:
         """Directions (dx, dy, A dx) of the Newton system whose multiplier rows read dz = shift + weights * A dx."""
         ...
 
@@ -123,7 +126,7 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
     """Run the loop until every active lane is finished.
 
     Centring is (mu_aff / mu)^3; a step goes to max(0.99, 1 - max(mu, step_cap)) of the way to the boundary. A lane is finished
-    when its certified bounds have met, or when three steps in a row cut their gap by less than a tenth; then it freezes:
+    when its certified bounds have met, or when `patience` steps in a row cut their gap by less than a tenth; then it freezes:
     nothing of it changes any more, whatever its neighbours do. A step that is not finite is not taken.
 
     Args:
@@ -133,9 +136,9 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
     """
     lanes = len(problem.lanes)
     present = problem.present
-    count = _reduce(jnp.add, jax.tree.map(lambda p, s: jnp.broadcast_to(p, s.shape), present, problem.start().s), lanes)
+    iterate = fenced(problem.start)()
+    count = _reduce(jnp.add, jax.tree.map(lambda p, s: jnp.broadcast_to(p, s.shape), present, iterate.s), lanes)
     inverse_count = 1 / jnp.maximum(count, 1)
-    iterate = problem.start()
     mu = _product(iterate.s, iterate.z, lanes) * inverse_count
 
     def unfinished(carry: _Carry) -> jax.Array:
@@ -158,7 +161,7 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
             record=record,
             best_gap=jnp.where(improved, gap, carry.best_gap),
             stalled=stalled,
-            active=active & ~closed & (stalled < 3),
+            active=active & ~closed & (stalled < settings.patience),
             iterations=carry.iterations + active,
             mu=jnp.where(take, mu, carry.mu),
             step=carry.step + 1,
@@ -166,8 +169,8 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
 
     first = _Carry(
         iterate=iterate,
-        residuals=problem.residuals(iterate),
-        record=problem.first_record(),
+        residuals=fenced(problem.residuals)(iterate),
+        record=fenced(problem.first_record)(),
         best_gap=jnp.full_like(mu, jnp.inf),
         stalled=jnp.zeros(problem.lanes, jnp.int32),
         active=active,
@@ -205,11 +208,6 @@ def _predict_correct(
 
     inverse_s, inverse_z, weights, affine_shift = weigh(iterate.s, iterate.z, residuals.rows)
     factors = problem.factor(weights)
-
-    def direction(shift: Tree) -> tuple[Iterate, jax.Array, jax.Array]:
-        dx, dy, rows = problem.solve(factors, weights, residuals, shift)
-        ds, dz, primal, dual = blocking(rows, shift, weights, residuals.rows, inverse_s, inverse_z)
-        return Iterate(dx, dy, ds, dz), primal, dual
 
     @fenced
     def blocking(rows: Tree, shift: Tree, weights: Tree, lacking: Tree, inverse_s: Tree, inverse_z: Tree) -> tuple:
@@ -253,8 +251,15 @@ def _predict_correct(
             new = new._replace(s=kept_s, z=kept_z)
         return new, mu_new
 
-    affine, primal, dual = direction(affine_shift)
-    step, primal, dual = direction(correct(iterate, affine, primal, dual, mu, inverse_s))
+    def phase(_: jax.Array, state: tuple) -> tuple:
+        shift, *_ = state
+        dx, dy, rows = problem.solve(factors, residuals, shift)
+        ds, dz, primal, dual = blocking(rows, shift, weights, residuals.rows, inverse_s, inverse_z)
+        step = Iterate(dx, dy, ds, dz)
+        return correct(iterate, step, primal, dual, mu, inverse_s), step, primal, dual
+
+    # The predictor's direction, then the corrector's.
+    _, step, primal, dual = repeat(2, phase, (affine_shift, iterate, mu, mu))
     return advance(iterate, step, primal, dual, mu)
 
 
@@ -275,14 +280,6 @@ def _reduce(op: Any, tree: Tree, lanes: int) -> jax.Array:
             part = fold(op, part)
         parts.append(part)
     return fold(op, parts)
-
-
-def fold(op: Any, parts: Any) -> jax.Array:
-    """Combine the entries along the leading axis with a binary operation, pairwise."""
-    parts = list(parts)
-    while len(parts) > 1:
-        parts = [op(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i] for i in range(0, len(parts), 2)]
-    return parts[0]
 
 
 def _where(mask: jax.Array, new: Tree, old: Tree) -> Tree:

@@ -102,4 +102,6 @@ def _tiled(
     def elsewhere() -> Tree:
         return in_tiles(min(LARGE_TILE, lanes), solve)
 
+    if jax.default_backend() == "cpu":
+        return on_cpu()
     return lax.platform_dependent(cpu=on_cpu, default=elsewhere)
