@@ -24,6 +24,7 @@ def draw_grasp(
     active: Bool[np.ndarray, " contacts"] | None = None,
     load: Float[np.ndarray, "3"] | None = None,
     surface: Float[np.ndarray, "points 3"] | None = None,
+    scale: float | None = None,
     colours: Sequence[str] = CONTACT_COLOURS,
 ) -> float:
     """Draws a grasp with equal aspect, each finger pushing from outside with the tip of its force at the contact.
@@ -39,10 +40,11 @@ def draw_grasp(
         active: False where a contact is absent; all present where None.
         load: A direction in which a weight pulls at the centre of mass, drawn as an arrow.
         surface: Points on the object that hint at its shape, m.
+        scale: Newtons per millimetre of the drawing; chosen so that the longest arrow fits where None.
         colours: One a contact, in turn.
 
     Returns:
-        The scale of the forces, newtons per millimetre of the drawing.
+        The scale of the forces, newtons per millimetre of the drawing; NaN where there are none.
     """
     present = np.ones(len(positions), bool) if active is None else active
     points = positions[present] * _MILLIMETRES
@@ -50,7 +52,9 @@ def draw_grasp(
     forces, friction = forces[present], friction[present]
     reach = float(np.linalg.norm(points, axis=-1).max())
     strength = np.nan_to_num(np.linalg.norm(forces, axis=-1))
-    scale = _round_scale(float(strength.max()) / (0.75 * reach)) if strength.any() else np.nan
+    if scale is None:
+        scale = _round_scale(float(strength.max()) / (0.75 * reach)) if strength.any() else np.nan
+    _frame(axes, points, reach)
     if surface is not None:
         axes.scatter(*(surface * _MILLIMETRES).T, s=5.0, color="0.6", alpha=0.5, linewidths=0, depthshade=False)
     for i, number in enumerate(np.flatnonzero(present).tolist()):
@@ -69,7 +73,6 @@ def draw_grasp(
     axes.scatter(0.0, 0.0, 0.0, color="black", marker="+", s=45, linewidths=1.2, depthshade=False)
     if load is not None:
         _draw_arrow(axes, np.zeros(3), 0.6 * reach * load / np.linalg.norm(load), "black", 0.16 * reach)
-    _frame(axes, points, reach)
     return scale
 
 
@@ -123,11 +126,15 @@ def _draw_arrow(axes: Any, tail: np.ndarray, tip: np.ndarray, colour: str, head:
 
 
 def _frame(axes: Any, points: np.ndarray, reach: float) -> None:
-    # Seen along the direction in which the contacts spread least, from a little above.
+    # Seen along the direction in which the contacts spread least, from above.
     _, _, directions = np.linalg.svd(points - points.mean(axis=0))
     view = directions[-1] * (1.0 if directions[-1, 2] >= 0.0 else -1.0)
     elevation = np.clip(np.degrees(np.arcsin(np.clip(view[2], -1.0, 1.0))), 18.0, 40.0)
-    axes.view_init(elev=float(elevation), azim=float(np.degrees(np.arctan2(view[1], view[0]))))
+    azimuth = float(np.degrees(np.arctan2(view[1], view[0])))
+    # Never straight along x or y, where one axis would be seen end on.
+    quadrant, within = divmod(azimuth, 90.0)
+    azimuth = 90.0 * quadrant + min(max(within, 20.0), 70.0)
+    axes.view_init(elev=float(elevation), azim=azimuth)
     limit = 1.35 * reach
     box = (-limit, limit)
     axes.set(xlim=box, ylim=box, zlim=box, xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
