@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from jaxgrasp.disturbance import DisturbanceSet
     from jaxgrasp.ranking import Ranking
 
-TABLE_ENDINGS = (".parquet", ".csv", ".npz")
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 BOX = (1.0, 1.0, 1.0, 0.02, 0.02, 0.02)
 SAMPLED = 10_000
@@ -85,6 +84,8 @@ class Rank:
         return self._rank(candidates, disturbances, unit)
 
     def _check(self) -> None:
+        from jaxgrasp.ranking import TABLE_ENDINGS
+
         checks = [
             ("--friction", self.friction, self.friction is None or 0.0 <= self.friction < math.inf, "a number >= 0"),
             ("--max-force", self.max_force, self.max_force is None or 0.0 < self.max_force < math.inf, "newtons > 0"),
