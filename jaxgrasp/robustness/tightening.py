@@ -1,8 +1,5 @@
 """Tightening forces: the largest-minimum resisted disturbance (21) and the least effort (22)."""
 
-import dataclasses
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -15,7 +12,7 @@ from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.program import Program, scaled_program
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.block_kkt import MarginProblem, Record
+from jaxgrasp.solvers.block_kkt import EffortProblem, MarginProblem, Record
 from jaxgrasp.solvers.status import Status
 
 _SETTINGS = {
@@ -24,6 +21,14 @@ _SETTINGS = {
     ),
     "float32": interior_point.Settings(
         tolerance=3e-6, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3
+    ),
+}
+_EFFORT_SETTINGS = {
+    "float64": interior_point.Settings(
+        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=0.0
+    ),
+    "float32": interior_point.Settings(
+        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3
     ),
 }
 # A gap that did not close to the tolerance still counts as solved below this one.
@@ -145,13 +150,14 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     )
     low, high = record.lower, record.upper
     size = jnp.maximum(1, jnp.abs(low))
-    closed = high - low <= _ACCEPTED_GAP[dtype.name] * size
+    closed = high - low <= _ACCEPTED_GAP[dtype.name] * jnp.where(jnp.isinf(low), 1, size)
     bearable = low >= -settings.tolerance
 
     margin, upper = low * program.scale, high * program.scale
     margin = jnp.where(program.slippery, jnp.minimum(margin, 0), margin)
     upper = jnp.where(program.slippery, jnp.minimum(upper, 0), upper)
     hopeless = high < -settings.tolerance
+    upper = jnp.where(hopeless & jnp.isinf(low), 0, upper)
     margin = jnp.where(hopeless & ~closed, jnp.nan, margin)
     decided = [
         (~grasps.valid, Status.INVALID_INPUT, jnp.nan),
@@ -201,4 +207,64 @@ def _largest(rows: tuple) -> jax.Array:
 
 
 def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Record) -> Solution:
-    raise NotImplementedError
+    """(22) for lanes, from what (21) left."""
+    dtype, blocks = program.rhs.dtype, program.blocks
+    settings = _EFFORT_SETTINGS[dtype.name]
+    sigma = jnp.where(program.undisturbed, 0, blocks.sigma)
+    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.margin / program.scale)
+    reachable = grasps.margin <= first.upper_bound * (1 + settings.tolerance)
+    held = (reachable & jnp.isfinite(record.lower)) | program.undisturbed
+
+    units = jnp.stack([program.tangential, program.tangential, program.normal])
+    eye = jnp.eye(3, dtype=dtype)[..., None, None]
+    weights = eye if grasps.weights is None else jnp.moveaxis(grasps.weights, 0, 2)
+    hessian = weights * units[:, None] * units * blocks.present
+    largest = jnp.max(jnp.abs(hessian), (0, 1, 2))
+    largest = jnp.where(largest > 0, largest, 1)
+
+    # Between (21)'s answer and its start, which is deep inside the rows, but for those that the margin asks for.
+    problem = MarginProblem((blocks,), program.rhs, program.dropped, program.radius)
+    centre = problem.start().x[0]
+    attained = problem.attained(centre)
+    share = (wanted - attained) / jnp.maximum(record.lower - attained, 1e-3)
+    share = 0.5 * (1 + jnp.clip(share, 0, 1))
+    problem = EffortProblem(
+        (blocks._replace(h=blocks.h - sigma * wanted, hessian=hessian / largest),),
+        program.rhs,
+        program.dropped,
+        program.radius,
+        tuple(share * x + (1 - share) * c for x, c in zip(record.x, centre, strict=True)),
+    )
+    active = grasps.valid & ~program.wrench_outside & held & (first.status != Status.INFEASIBLE)
+    outcome = interior_point.solve(problem, settings, active)
+    best = outcome.record
+    gap = (best.upper - best.lower) / problem.gap_scale(best)
+    closed = gap <= _ACCEPTED_GAP[dtype.name]
+
+    status = jnp.select(
+        [~grasps.valid, ~active, closed, program.doubtful],
+        [Status.INVALID_INPUT, Status.INFEASIBLE, Status.SOLVED, Status.ILL_CONDITIONED],
+        Status.MAX_ITERATIONS,
+    ).astype(jnp.int32)
+    answered = active & jnp.isfinite(best.upper)
+    hide = lambda x: jnp.where(answered, x, jnp.nan)  # noqa: E731
+    attained = MarginProblem((blocks._replace(sigma=sigma),), program.rhs, program.dropped, program.radius).attained(best.x)
+    attained = jnp.where(program.undisturbed, jnp.inf, attained * program.scale)
+    attained = jnp.where(program.disturbance_outside | program.slippery, 0, attained)
+    forces = program.forces(best.x[0]) * blocks.present[:, None]
+    multipliers = best.z[0] * largest / program.row_units()
+    return Solution(
+        margin=hide(attained),
+        upper_bound=first.upper_bound,
+        forces=hide(forces),
+        effort=hide(_effort(forces, grasps.weights)),
+        status=status,
+        iterations=first.iterations + outcome.iterations,
+        primal_residual=hide(problem.violations(best.x, jnp.zeros_like(wanted))),
+        dual_residual=hide(_largest(outcome.residuals.dual)),
+        gap=hide(gap),
+        rank=program.rank,
+        cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
+        bound_multipliers=multipliers[-1],
+        wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * largest,
+    )

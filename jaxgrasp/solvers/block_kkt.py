@@ -308,14 +308,15 @@ class MarginProblem(BlockProblem):
     """max lambda; x is (blocks, lambda). Record: `lower` is attained by `x`, `upper` is certified by (y, z), sum sigma z = 1."""
 
     def attained(self, x: Rows) -> jax.Array:
-        """min (h - A x) / sigma, the lambda that x attains when E x = b; -huge where a row with sigma = 0 is violated."""
+        """min (h - A x) / sigma, the lambda that x attains when E x = b; -inf where a row with sigma = 0 is violated."""
         parts = []
         for g, x_g in zip(self.groups, x, strict=True):
             info = jnp.finfo(g.h.dtype)
             # A row that lambda hardly moves may miss its right-hand side by rounding.
             soft = g.h + jnp.where(g.sigma <= 1e4 * info.eps, 8 * info.eps, 0)
             parts.append(_least((soft - _apply(g, x_g)) / jnp.maximum(g.sigma, 4 * info.tiny)))
-        return fold(jnp.minimum, parts)
+        least = fold(jnp.minimum, parts)
+        return jnp.where(least < -1e12, -jnp.inf, least)
 
     def start(self) -> Iterate:
         """Closed form: light forces that meet E x = b, a lambda well below what they attain, multipliers with A'z = 0."""
@@ -385,6 +386,11 @@ class MarginProblem(BlockProblem):
         x = tuple(jnp.zeros_like(g.columns[0]) for g in self.groups)
         return Record(-inf, inf, x, *self.first_multipliers())
 
+    def gap_scale(self, record: Record) -> jax.Array:
+        """Gaps count relative to max(1, |lambda|); where no x attains anything, a negative upper bound says all there is to know."""
+        hopeless = jnp.isinf(record.lower) & (record.upper < -1e-6)
+        return jnp.where(hopeless, jnp.inf, jnp.maximum(1, jnp.where(jnp.isinf(record.lower), 1, jnp.abs(record.lower))))
+
     def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
         """Both bounds."""
         x = fenced(self.project)(iterate.x[0])
@@ -394,8 +400,10 @@ class MarginProblem(BlockProblem):
         value = fold(jnp.add, [_total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
         value = value + fold(jnp.add, iterate.y * self.rhs)
         best = jnp.maximum(lower, record.lower)
+        # Where nothing is attained yet, the bound holds for lambda >= 0; a negative one then excludes these, which is all it says.
+        radius = 1 + self.radius * jnp.where(jnp.isinf(best), 0, jnp.maximum(0, -best))
         scale = 1 / pull
-        upper = jnp.where(pull > 0, (value + (1 + self.radius * jnp.maximum(0, -best)) * lost) * scale, jnp.inf)
+        upper = jnp.where(pull > 0, (value + radius * lost) * scale, jnp.inf)
         rises, falls = lower > record.lower, upper < record.upper
         return Record(
             lower=best,
@@ -403,4 +411,77 @@ class MarginProblem(BlockProblem):
             x=tuple(jnp.where(rises, n, o) for n, o in zip(x, record.x, strict=True)),
             y=jnp.where(falls, iterate.y * scale, record.y),
             z=tuple(jnp.where(falls, n * scale, o) for n, o in zip(iterate.z, record.z, strict=True)),
+        )
+
+
+@dataclass(frozen=True)
+class EffortProblem(BlockProblem):
+    """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at. Record: `upper` is attained by `x`, `lower` is certified by (y, z).
+
+    H is scaled so that its largest entry is 1. Without lambda the blocks' bounds are |x|_inf <= 1.
+
+    guess: where to start, meeting E x = b about, well inside the rows if possible.
+    """
+
+    guess: Rows = ()
+    bordered = False
+
+    def start(self) -> Iterate:
+        """From the guess, with slacks of at least 0.03 and multipliers on the central path."""
+        blocks = self.project(self.guess)
+        s = tuple(
+            jnp.where(g.present > 0, jnp.maximum(g.h - _apply(g, x), 0.03), 1)
+            for g, x in zip(self.groups, blocks, strict=True)
+        )
+        z = tuple(0.02 * g.present / s_g for g, s_g in zip(self.groups, s, strict=True))
+        pull = tuple(self._gradient(g, x) + _adjoint(g, z_g) for g, x, z_g in zip(self.groups, blocks, z, strict=True))
+        return Iterate(blocks, -self.equality(pull), s, z)
+
+    def _gradient(self, g: Blocks, x: jax.Array) -> jax.Array:
+        return fold(jnp.add, g.hessian * x[:, None])
+
+    def residuals(self, iterate: Iterate) -> Residuals:
+        """Of stationarity, of E x = b and of the rows."""
+        blocks = iterate.x
+        dual = tuple(
+            self._gradient(g, x) + _adjoint(g, z) + e
+            for g, x, z, e in zip(self.groups, blocks, iterate.z, self.pull_back(iterate.y), strict=True)
+        )
+        rows = tuple(_apply(g, x) + s - g.h for g, x, s in zip(self.groups, blocks, iterate.s, strict=True))
+        return Residuals(dual, self.equality(blocks) - self.rhs, rows)
+
+    def solve(self, factors: _Factors, residuals: Residuals, shift: Rows) -> tuple:
+        """See `interior_point.Problem`."""
+        rhs = tuple(-d - _adjoint(g, e) for g, d, e in zip(self.groups, residuals.dual, shift, strict=True))
+        dx, _, dy = self._newton(factors, rhs, None, -residuals.primal)
+        return dx, dy, tuple(_apply(g, d) for g, d in zip(self.groups, dx, strict=True))
+
+    def first_record(self) -> Record:
+        """Nothing is known."""
+        inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
+        return Record(-inf, inf, tuple(jnp.zeros_like(x) for x in self.guess), *self.first_multipliers())
+
+    def gap_scale(self, record: Record) -> jax.Array:
+        """The effort, but not less than a thousandth of a unit."""
+        return jnp.maximum(jnp.where(jnp.isinf(record.upper), 0, record.upper), 1e-3)
+
+    def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
+        """Both bounds; a point counts as attained when it misses the rows by rounding alone."""
+        x = fenced(self.project)(iterate.x)
+        missed = fold(jnp.maximum, [-_least(g.h - _apply(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)])
+        value = lambda x: 0.5 * fold(  # noqa: E731
+            jnp.add, [_total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
+        )
+        near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
+        upper = jnp.where(missed <= near, value(x), jnp.inf)
+        held = fold(jnp.add, [_total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
+        lost = fold(jnp.add, [_total(jnp.abs(d)) for d in residuals.dual])
+        lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - lost
+        falls, rises = upper < record.upper, lower > record.lower
+        return Record(
+            lower=jnp.where(rises, lower, record.lower),
+            upper=jnp.where(falls, upper, record.upper),
+            x=tuple(jnp.where(falls, n, o) for n, o in zip(x, record.x, strict=True)),
+            y=jnp.where(rises, iterate.y, record.y),
+            z=tuple(jnp.where(rises, n, o) for n, o in zip(iterate.z, record.z, strict=True)),
         )

@@ -26,7 +26,7 @@ Tree = Any
 class Settings(NamedTuple):
     """Numbers of the loop. All may be traced: changing them costs no recompilation, but for `equal_steps`.
 
-    tolerance: stop at upper - lower <= tolerance * max(1, |lower|).
+    tolerance: stop at upper - lower <= tolerance * the problem's gap_scale.
     max_iterations: steps at most.
     step_cap: how close to the boundary a step may end, 1 - step_cap at most when mu is large.
     mu_floor: smallest complementarity that is aimed at.
@@ -94,6 +94,10 @@ class Problem(Protocol):
         """The record before the first step; has `lower` and `upper`, certified bounds per lane."""
         ...
 
+    def gap_scale(self, record: Any) -> jax.Array:
+        """What gaps are measured by, per lane."""
+        ...
+
     def assess(self, iterate: Iterate, residuals: Residuals, record: Any) -> Any:
         """The record with this iterate taken into account; bounds only ever get better."""
         ...
@@ -153,8 +157,9 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         record = _where(active, fenced(problem.assess)(iterate, residuals, carry.record), carry.record)
         gap = record.upper - record.lower
         improved = gap < 0.9 * carry.best_gap
-        stalled = jnp.where(improved, 0, carry.stalled + 1)
-        closed = gap <= settings.tolerance * jnp.maximum(1, jnp.abs(record.lower))
+        # Until both bounds exist there is no gap to stall.
+        stalled = jnp.where(improved | jnp.isinf(gap), 0, carry.stalled + 1)
+        closed = gap <= settings.tolerance * problem.gap_scale(record)
         return _Carry(
             iterate=iterate,
             residuals=residuals,
@@ -185,7 +190,7 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         residuals=last.residuals,
         record=last.record,
         iterations=last.iterations,
-        converged=gap <= settings.tolerance * jnp.maximum(1, jnp.abs(last.record.lower)),
+        converged=gap <= settings.tolerance * problem.gap_scale(last.record),
         mu=last.mu,
     )
 
