@@ -46,3 +46,8 @@ def fenced(function: Callable[P, T]) -> Callable[P, T]:
 def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
     """`step(i, state)` for i = 0 .. count - 1: a loop where fences are on, where code size is compile time; else spelt out, for fusion."""
     return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() else True)
+
+
+def each(function: Callable[[T], jax.Array], parts: T) -> jax.Array:
+    """`function` of every entry along the leading axis, stacked: one after the other where fences are on, else at once."""
+    return jax.lax.map(function, parts) if _fences.get() else jax.vmap(function)(parts)

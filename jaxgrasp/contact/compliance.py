@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, fold
-from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.fence import each, fenced, repeat
 
 RANK_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}
 
@@ -128,9 +128,14 @@ def pseudo_inverse(columns: jax.Array, half: jax.Array | None) -> tuple[jax.Arra
     """
     basis = row_basis(_times_half(columns, half))
     rows = _half_times(basis.rows, half)
-    # On dropped rows the basis is zero, so what T holds there does not matter.
-    product = lambda rows, t: fold(jnp.add, [r[:, None] * o[None, :, None] for r, o in zip(rows, t, strict=True)])  # noqa: E731
-    return fenced(product)(rows, basis.operations), basis
+
+    @fenced
+    def assemble(rows: jax.Array, operations: jax.Array) -> jax.Array:
+        # On dropped rows the basis is zero, so what T holds there does not matter.
+        column = lambda t: fold(jnp.add, [r * t_r for r, t_r in zip(rows, t, strict=True)])  # noqa: E731
+        return jnp.moveaxis(each(column, jnp.moveaxis(operations, 1, 0)), 0, 1)
+
+    return assemble(rows, basis.operations), basis
 
 
 def _times_half(columns: jax.Array, half: jax.Array | None) -> jax.Array:

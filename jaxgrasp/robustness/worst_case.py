@@ -15,7 +15,7 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.sets import support
-from jaxgrasp.fence import fenced
+from jaxgrasp.fence import each, fenced
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 
 
@@ -55,17 +55,22 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, B
     @fenced
     def directions(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
         """Wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6, n, *lanes)."""
-        c, s, k = literal(pyramid_facets(cone_edges).T, inverse.dtype)[:, None, :, None, None]
-        cone = -(c * inverse[0][:, None] + s * inverse[1][:, None] + (k * friction) * inverse[2][:, None])
-        return jnp.concatenate([cone, inverse[2][:, None]], 1) * units[:, None, None]
+        c, s, k = literal(pyramid_facets(cone_edges).T, inverse.dtype)[..., None, None]
+
+        def component(each_wrench: tuple) -> jax.Array:
+            inverse, unit = each_wrench
+            cone = -(c * inverse[0] + s * inverse[1] + (k * friction) * inverse[2])
+            return jnp.concatenate([cone, inverse[2:]]) * unit
+
+        return each(component, (jnp.moveaxis(inverse, 1, 0), units))
 
     inverse, basis = pseudo_inverse(grasps.columns, grasps.half)
     if grasps.vertex_halves is None:
         reach = fenced(support)(grasps.terms, directions(inverse, grasps.friction, grasps.units))
     else:
 
-        def worse(reach: jax.Array, each: tuple) -> tuple[jax.Array, None]:
-            half, wrench = each
+        def worse(reach: jax.Array, vertex: tuple) -> tuple[jax.Array, None]:
+            half, wrench = vertex
             rows = directions(pseudo_inverse(grasps.columns, half)[0], grasps.friction, grasps.units)
             return jnp.maximum(reach, jnp.sum(rows * wrench[:, None, None], 0)), None
 

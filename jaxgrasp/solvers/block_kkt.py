@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.fence import each, fenced, repeat
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 
 Rows = tuple[jax.Array, ...]
@@ -207,14 +207,19 @@ class BlockProblem:
 
         @fenced
         def reduce(blocks: list[_BlockFactor], weights: Rows) -> tuple:
-            terms = [_over_blocks(c[:, None] * c, 2) for f in blocks for c in f.columns]
+            columns = [f.columns for f in blocks]
+
+            def row(r: jax.Array) -> jax.Array:
+                return fold(jnp.add, [_over_blocks(c[r] * c, 1) for each_k in columns for c in each_k])
+
+            matrix = each(row, jnp.arange(self.rhs.shape[0]))
             if not self.bordered:
-                return fold(jnp.add, terms), None, None
+                return matrix, None, None
             sides = [_over_blocks(c * -t, 1) for f in blocks for c, t in zip(f.columns, f.theta, strict=True)]
             # As a sum of squares: sigma'W sigma - p'P^-1 p would cancel near the optimum.
             lean = [g.sigma - _apply(g, f.phi) for g, f in zip(self.groups, blocks, strict=True)]
             kappa = fold(jnp.add, [_total(w * e * e) for w, e in zip(weights, lean, strict=True)])
-            return fold(jnp.add, terms), fold(jnp.add, sides), 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
+            return matrix, fold(jnp.add, sides), 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
 
         @fenced
         def complete(matrix: jax.Array, v: jax.Array | None, border: jax.Array | None) -> jax.Array:
@@ -231,8 +236,8 @@ class BlockProblem:
 
         @fenced
         def weigh(w: jax.Array) -> jax.Array:
-            products = jnp.stack([g.patterns[:, i] * g.patterns[:, j] for i, j in pairs], 1)
-            return fold(jnp.add, _spread(products, w) * w[:, None])
+            products = jnp.stack([g.patterns[:, i] * g.patterns[:, j] for i, j in pairs])
+            return each(lambda p: fold(jnp.add, _spread(p, w) * w), products)
 
         @fenced
         def cholesky(gram: jax.Array) -> tuple:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.scipy.linalg import lu_factor, lu_solve
 from jax.typing import ArrayLike
 
@@ -37,11 +38,13 @@ class _Constants(NamedTuple):
 
 
 _CONSTANTS = {
-    "float32": _Constants(1e-6, 1e-4, 1e-6, 1e-3, 1e-12),
-    "float64": _Constants(1e-9, 1e-7, 1e-9, 1e-4, 1e-20),
+    "float32": _Constants(3e-6, 5e-5, 1e-6, 1e-2, 1e-12),
+    "float64": _Constants(1e-9, 1e-7, 1e-9, 1e-2, 1e-20),
 }
 _REFINEMENTS = 2
 _EQUILIBRATIONS = 10
+# Steps without progress at the start, while tau finds its size, are common.
+_PATIENCE = 8
 
 
 @jax.tree_util.register_dataclass
@@ -86,10 +89,11 @@ class _Program(NamedTuple):
 
 
 class _Factors(NamedTuple):
-    """LU of the Newton matrix, the scaling of its last rows, and its solution for (-q, b, h)."""
+    """LU of the Newton matrix, the scaling of its last rows, the weights, and its solution for (-q, b, h)."""
 
     lu: tuple[jax.Array, jax.Array]
     scale: jax.Array
+    weights: jax.Array
     ray: tuple[jax.Array, jax.Array, jax.Array]
 
 
@@ -116,11 +120,9 @@ class _Embedding:
         return jnp.ones((self.program.h.size + 1,), self.program.h.dtype)
 
     def start(self) -> Iterate:
-        """The least-squares point of the program, shifted into the interior, with tau = kappa = 1."""
-        x, y, z = self.factor(self.present).ray
-        s, z = (v + jnp.where(jnp.min(v, initial=1) > 0, 0, 1 - jnp.min(v, initial=0)) for v in (-z, z))
-        one = self.present[-1:]
-        return Iterate(x, y, *(jnp.concatenate([jnp.maximum(v, 1e-2), one]) for v in (s, z)))
+        # Nothing that is fitted to the data does better over all families, and a least-squares point can be far too large.
+        q, b = self.program.q, self.program.b
+        return Iterate(jnp.zeros_like(q), jnp.zeros_like(b), self.present, self.present)
 
     def residuals(self, iterate: Iterate) -> Residuals:
         """The embedding is not linear in tau, so `dual` takes along the iterate at which it is linearised."""
@@ -138,25 +140,29 @@ class _Embedding:
         rows = jnp.concatenate([A, scale[:, None] * G])
         diagonal = jnp.concatenate([jnp.full(p, small, w.dtype), 1 / (1 + w)])
         lu = lu_factor(jnp.block([[P + small * jnp.eye(n, dtype=w.dtype), rows.T], [rows, -jnp.diag(diagonal)]]))
-        return _Factors(lu, scale, self._newton(lu, scale, w, (-q, b, h)))
+        return _Factors(lu, scale, weights, self._newton(lu, scale, w, (-q, b, h)))
 
     def _newton(self, lu: tuple, scale: jax.Array, w: jax.Array, right: tuple) -> tuple:
         """Solve P x + A'y + G'z = r1, A x = r2, G x - z/w = r3 with refinement, which also takes back the regularisation."""
         P, _, A, _, G, _ = self.program
         p, n = A.shape
-        x, y, z = solution = tuple(map(jnp.zeros_like, right))
-        for _ in range(1 + _REFINEMENTS):
+
+        def refine(_: int, solution: tuple) -> tuple:
+            x, y, z = solution
             lacking = (right[0] - P @ x - A.T @ y - G.T @ z, right[1] - A @ x, scale * (right[2] - G @ x + z / w))
             step = lu_solve(lu, jnp.concatenate(lacking))
-            x, y, z = solution = x + step[:n], y + step[n : n + p], z + scale * step[n + p :]
-        return solution
+            return x + step[:n], y + step[n : n + p], z + scale * step[n + p :]
 
-    def solve(self, factors: _Factors, weights: jax.Array, residuals: Residuals, shift: jax.Array) -> tuple:
+        return lax.fori_loop(0, 1 + _REFINEMENTS, refine, tuple(map(jnp.zeros_like, right)))
+
+    def solve(self, factors: _Factors, residuals: Residuals, shift: jax.Array) -> tuple:
         P, q, A, b, G, h = self.program
         lacking, (x, _, s, z) = residuals.dual
-        # Homogeneous residuals can only vanish together with s'z, so they are made to fall in the same proportion as s'z.
-        aim = s @ (shift + z - weights * residuals.rows)
-        share = jnp.clip(1 - aim / (s @ z), 0, 1)
+        weights = factors.weights
+        # Homogeneous residuals can only vanish together with s'z, so they are made to fall in the same proportion. A row's
+        # shift shows what the loop aims at but for a second-order term; that is small in most rows, hence the median.
+        aim = jnp.median(s * (shift + z - weights * residuals.rows))
+        share = jnp.clip(1 - aim / jnp.mean(s * z), 0, 1)
         lag = (1 - share) * residuals.rows
         w, tau = weights[:-1], z[-1]
         dx, dy, dz = self._newton(
@@ -166,9 +172,9 @@ class _Embedding:
         slope = 2 * (P @ at) + q
         bend = (x1 - at) @ P @ (x1 - at) + z1 @ (z1 / w)
         dtau = (shift[-1] / weights[-1] + slope @ dx + b @ dy + h @ dz - lag[-1]) / (1 / weights[-1] + bend)
-        dx, dy = dx + dtau * x1, dy + dtau * y1
-        rows = jnp.append(G @ dx - h * dtau - lag[:-1], (dtau - shift[-1]) / weights[-1])
-        return dx, dy, rows
+        # From dz, not as G dx - h dtau: times the weights, rounding in those would swamp the multipliers of active rows.
+        dz = jnp.append(dz + dtau * z1, dtau)
+        return dx + dtau * x1, dy + dtau * y1, (dz - shift) / weights
 
     def first_record(self) -> _Record:
         infinite = jnp.asarray(jnp.inf, self.program.q.dtype)
@@ -194,9 +200,12 @@ class _Embedding:
         new = _Record(record.lower, record.upper, errors[best], iterate, best.astype(record.shows.dtype))
         new = jax.tree.map(lambda n, o: jnp.where(new.error < record.error, n, o), new, record)
         # While tau finds its size the error may rest; as long as s'z falls, the loop is getting on.
-        done, mu = self.constants.tolerance, jnp.mean(iterate.s * iterate.z)
-        pace = jnp.maximum(jnp.sqrt(new.error * jnp.minimum(mu, 1)), 2 * done)
-        return new._replace(upper=jnp.where(new.error <= done, new.error, jnp.minimum(pace, record.upper)))
+        pace = jnp.sqrt(new.error * jnp.mean(iterate.s * iterate.z))
+        return new._replace(upper=jnp.minimum(pace, record.upper))
+
+    def gap_scale(self, record: _Record) -> jax.Array:
+        """The error alone says whether a lane is finished."""
+        return jnp.where(record.error <= self.constants.tolerance, jnp.inf, 0)
 
 
 def _largest(v: jax.Array) -> jax.Array:
@@ -211,7 +220,7 @@ def _typical(v: jax.Array) -> jax.Array:
     """Geometric mean of the entries that are not zero, which a few huge right-hand sides do not drag along; 1 if none."""
     nonzero = v != 0
     logs = jnp.where(nonzero, jnp.log(jnp.abs(jnp.where(nonzero, v, 1))), 0)
-    return jnp.exp(jnp.sum(logs) / jnp.maximum(jnp.sum(nonzero), 1))
+    return jnp.exp(jnp.sum(logs) / jnp.maximum(jnp.sum(nonzero, dtype=v.dtype), 1))
 
 
 def _equilibrated(program: _Program) -> tuple[_Program, Iterate]:
@@ -223,10 +232,12 @@ def _equilibrated(program: _Program) -> tuple[_Program, Iterate]:
     (p, n), m = A.shape, h.size
     rows = jnp.concatenate([A, G])
     matrix = jnp.block([[P, rows.T], [rows, jnp.zeros((p + m, p + m), P.dtype)]])
-    scale = jnp.ones(n + p + m, P.dtype)
-    for _ in range(_EQUILIBRATIONS):
+
+    def equilibrate(_: int, scale: jax.Array) -> jax.Array:
         largest = jnp.max(jnp.abs(matrix) * scale * scale[:, None], 1)
-        scale = scale / jnp.sqrt(jnp.where(largest > 0, largest, 1))
+        return scale / jnp.sqrt(jnp.where(largest > 0, largest, 1))
+
+    scale = lax.fori_loop(0, _EQUILIBRATIONS, equilibrate, jnp.ones(n + p + m, P.dtype))
     d, e, f = scale[:n], scale[n : n + p], scale[n + p :]
     cost, size = 1 / _typical(q * d), 1 / _typical(jnp.concatenate([b * e, h * f]))
     scaled = _Program(
@@ -245,7 +256,7 @@ def _solve_one(program: _Program) -> QPSolution:
     valid = finite & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
     program = _Program(*(jnp.where(valid, v, 0) for v in program._replace(P=P)))
     scaled, back = _equilibrated(program)
-    settings = Settings(constants.tolerance, 60, constants.step_cap, constants.mu_floor, True, 0.0)
+    settings = Settings(constants.tolerance, 60, constants.step_cap, constants.mu_floor, True, 0.0, _PATIENCE)
     outcome = interior_point.solve(_Embedding(scaled, constants), settings, valid)
     record, iterate = outcome.record, outcome.record.iterate
     found = jnp.where(record.error <= constants.accept, record.shows, int(Status.MAX_ITERATIONS))

@@ -167,7 +167,7 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
             best_gap=jnp.where(improved, gap, carry.best_gap),
             stalled=stalled,
             active=active & ~closed & (stalled < settings.patience),
-            iterations=carry.iterations + active,
+            iterations=carry.iterations + active.astype(jnp.int32),
             mu=jnp.where(take, mu, carry.mu),
             step=carry.step + 1,
         )
@@ -278,6 +278,9 @@ def _product(a: Tree, b: Tree, lanes: int) -> jax.Array:
 
 def _reduce(op: Any, tree: Tree, lanes: int) -> jax.Array:
     """Reduce all leaves over everything but the trailing lane axes, unrolled: XLA's CPU code vectorises over lanes."""
+    if not lanes:
+        # Nothing to vectorise over, and a hundred rows would be a hundred operations.
+        return fold(op, [op.reduce(leaf, axis=None) for leaf in jax.tree.leaves(tree)])
     parts = []
     for leaf in jax.tree.leaves(tree):
         part = leaf

@@ -17,7 +17,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxgrasp.fence import fences
 
 Tree = Any
-# Values of one row of a tile; 64 lanes of four contacts were fastest, and a tile has to fit in the second-level cache.
+# Values of one row of a tile: its working set has to fit in the second-level cache.
 TILE = 256
 LARGE_TILE = 1 << 17
 
@@ -90,14 +90,17 @@ def _tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
-        tile = jax.jit(solve)
+        tile, size = jax.jit(solve), min(1 << max(0, (TILE // blocks).bit_length() - 1), 64)
 
         def one(parts: list[jax.Array]) -> Tree:
-            # XLA's CPU backend then emits the tile as one function, free of the overhead it has for every operation.
-            with fences(True), set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-                return tile(parts)
+            with fences(True):
+                if lanes <= size:
+                    return solve(parts)
+                # XLA's CPU backend then emits the tile as one function, free of the overhead it has for every operation.
+                with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+                    return tile(parts)
 
-        return in_tiles(min(max(16, TILE // blocks // 8 * 8), 64, lanes), one)
+        return in_tiles(min(size, lanes), one)
 
     def elsewhere() -> Tree:
         return in_tiles(min(LARGE_TILE, lanes), solve)
