@@ -64,7 +64,6 @@ BAD_DATA = {
     "infinite load": {"required_wrench": ((4,), np.inf)},
     "NaN cone margin": {"cone_margin": ((), np.nan)},
     "negative cone margin": {"cone_margin": ((), -0.1)},
-    "nobody there": {"active": ((), False)},
 }
 
 
@@ -80,6 +79,15 @@ def assert_alone(ours, clean) -> None:
 @pytest.mark.parametrize("name", BAD_DATA)
 def test_bad_data_marks_one_lane_alone(batch, clean, name):
     assert_alone(harness.as_numpy(largest(*harness.data_of(spoil(batch, **BAD_DATA[name])))), clean)
+
+
+def test_a_grasp_without_contacts_holds_nothing(batch, clean):
+    ours = harness.as_numpy(largest(*harness.data_of(spoil(batch, active=((), False)))))
+    assert not batch.required_wrench[BAD].any()
+    assert ours.status[BAD] == jg.Status.SOLVED and ours.margin[BAD] == 0 and ours.rank[BAD] == 0
+    assert not ours.forces[BAD].any()
+    others = np.arange(len(batch)) != BAD
+    np.testing.assert_array_equal(ours.margin[others], clean.margin[others])
 
 
 @pytest.mark.parametrize("normal", [np.zeros(3), np.array([np.nan, 0, 1]), np.array([0, np.inf, 0])])
@@ -145,11 +153,10 @@ def shaped(**shapes) -> jg.Contacts:
 @pytest.mark.parametrize(
     ("name", "got", "wanted"),
     [
-        ("positions", (2, 4, 2), "3"),
-        ("positions", (3,), "3"),
-        ("frames", (2, 4, 3), "3, 3"),
-        ("frames", (2, 5, 3, 3), "3, 3"),
-        ("frames", (3, 4, 3, 3), "2"),
+        ("positions", (2, 4, 2), "n_c, 3"),
+        ("positions", (3,), "n_c, 3"),
+        ("frames", (2, 4, 3), "n_c, 3, 3"),
+        ("frames", (2, 5, 3, 3), "n_c, 3, 3"),
         ("friction", (2, 5), "4"),
         ("max_force", (3,), "4"),
     ],
@@ -167,6 +174,7 @@ def large(contacts, disturbances=None, **options):
 
 
 MISMATCHES = {
+    "frames of another batch": (lambda c: shaped(frames=(7, 4, 3, 3)), "7"),
     "wrenches": (lambda c: jg.DisturbanceSet.vertices(jnp.ones((4, 5))), "5"),
     "half_extents": (lambda c: jg.DisturbanceSet.box(jnp.ones(5)), "5"),
     "shape_matrix": (lambda c: jg.DisturbanceSet.ellipsoid(jnp.ones((6, 5))), "6, 5"),
