@@ -16,6 +16,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 P = ParamSpec("P")
 T = TypeVar("T")
+U = TypeVar("U")
 
 _fences = contextvars.ContextVar("fences", default=False)
 
@@ -48,6 +49,6 @@ def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
     return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() else True)
 
 
-def each(function: Callable[[T], jax.Array], parts: T) -> jax.Array:
+def each(function: Callable[[T], U], parts: T) -> U:
     """`function` of every entry along the leading axis, stacked: one after the other where fences are on, else at once."""
     return jax.lax.map(function, parts) if _fences.get() else jax.vmap(function)(parts)

@@ -41,7 +41,7 @@ class Basis(NamedTuple):
     """An orthonormal basis of the row space of r rows, and the row operations T that lead to it; lanes trail.
 
     rows: (r, k, n, *lanes), T times the given rows: orthonormal, or zero where dropped.
-    operations: (r, r, *lanes), T, lower triangular; a dropped row of T is a vector that the given rows do not reach.
+    operations: (r, r, *lanes), T; a dropped row of T is a vector that the given rows do not reach.
     kept: (r, *lanes), 1 or 0.
     ratios: (r, *lanes), what was left of each row, in lengths of the longest row.
     """
@@ -57,18 +57,19 @@ class Basis(NamedTuple):
 
 
 def row_basis(rows: jax.Array) -> Basis:
-    """Modified Gram-Schmidt of rows (r, k, n, *lanes), twice: the second sweep makes the basis orthonormal to rounding, however close the rows were.
+    """Modified Gram-Schmidt of rows (r, k, n, *lanes).
 
-    Rows that end up shorter than the tolerance become zero, and their operations stay unscaled.
+    Rows that end up shorter than the tolerance become zero, and their operations stay unscaled. One step of Newton and Schulz then makes
+    the basis orthonormal to rounding: it squares what close rows lost.
     """
     count, lanes = rows.shape[0], rows.shape[3:]
     index = jnp.arange(count).reshape(count, *[1] * len(lanes))
     eye = jnp.eye(count, dtype=rows.dtype).reshape(count, count, *[1] * len(lanes))
     longest = jnp.sqrt(fold(jnp.maximum, _dot(rows, rows)))
-    tolerance = RANK_TOLERANCE[rows.dtype.name]
+    least = RANK_TOLERANCE[rows.dtype.name] * longest
 
     @fenced
-    def remove(j: jax.Array, least: jax.Array, rows: jax.Array, operations: jax.Array, products: jax.Array) -> tuple:
+    def remove(j: jax.Array, rows: jax.Array, operations: jax.Array, products: jax.Array) -> tuple:
         length = jnp.sqrt(products[j])
         keep = length > least
         inverse = jnp.where(keep, 1 / jnp.where(keep, length, 1), 0)
@@ -77,18 +78,31 @@ def row_basis(rows: jax.Array) -> Basis:
         turned = jnp.where(own[:, None], operations * jnp.where(keep, inverse, 1), operations - share * operations[j])
         return jnp.where(own[:, None, None], rows * inverse, rows - share[:, None] * rows[j]), turned, length
 
-    def step(i: jax.Array, state: tuple) -> tuple:
+    def step(j: jax.Array, state: tuple) -> tuple:
         rows, operations, lengths = state
-        j = i % count
-        least = jnp.where(i < count, tolerance * longest, 0.5)
         products = fenced(lambda rows, j: _dot(rows, rows[j]))(rows, j)
-        rows, operations, length = remove(j, least, rows, operations, products)
-        return rows, operations, lengths.at[i].set(length)
+        rows, operations, length = remove(j, rows, operations, products)
+        return rows, operations, lengths.at[j].set(length)
 
-    state = (rows, jnp.broadcast_to(eye, (count, count, *lanes)), jnp.zeros((2 * count, *lanes), rows.dtype))
-    rows, operations, lengths = repeat(2 * count, step, state)
-    kept = (lengths[count:] > 0.5).astype(rows.dtype)
-    return Basis(rows, operations, kept, lengths[:count] / jnp.where(longest > 0, longest, 1))
+    state = (rows, jnp.broadcast_to(eye, (count, count, *lanes)), jnp.zeros((count, *lanes), rows.dtype))
+    rows, operations, lengths = repeat(count, step, state)
+    kept = (lengths > least).astype(rows.dtype)
+
+    @fenced
+    def correction(rows: jax.Array) -> jax.Array:
+        gram = each(lambda row: _dot(rows, row), rows)
+        return eye + 0.5 * (eye * kept - gram)
+
+    @fenced
+    def correct(factor: jax.Array, rows: jax.Array, operations: jax.Array) -> tuple:
+        apply = lambda f: (  # noqa: E731
+            fold(jnp.add, [f_r * r for f_r, r in zip(f, rows, strict=True)]),
+            fold(jnp.add, [f_r * o for f_r, o in zip(f, operations, strict=True)]),
+        )
+        return each(apply, factor)
+
+    rows, operations = correct(correction(rows), rows, operations)
+    return Basis(rows, operations, kept, lengths / jnp.where(longest > 0, longest, 1))
 
 
 def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array | None, jax.Array]:

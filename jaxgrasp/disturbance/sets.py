@@ -33,7 +33,8 @@ class DisturbanceSet:
         Raises:
             ValueError: another shape.
         """
-        return cls(terms=(Vertices(wrenches=as_float("wrenches", wrenches, ("n_d", 6))),))
+        given = as_float("wrenches", wrenches, ("n_d", 6))
+        return cls(terms=(Vertices(wrenches=given if given.shape[-2] else jnp.zeros((*given.shape[:-2], 1, 6), given.dtype)),))
 
     @classmethod
     def forces(cls, magnitude: ArrayLike = 1.0) -> "DisturbanceSet":

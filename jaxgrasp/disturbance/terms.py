@@ -39,11 +39,7 @@ class Term(Protocol):
         ...
 
     def extent(self) -> jax.Array:
-        """(6, *lanes): the largest |w_i| for every component."""
-        ...
-
-    def admissible(self) -> jax.Array:
-        """bool (*lanes): the data describe a set, given that they are finite."""
+        """(*batch, 6), for batch-first leaves: the largest |w_i| for every component; negative or NaN where the data are not a set."""
         ...
 
 
@@ -124,11 +120,7 @@ class Vertices:
 
     def extent(self) -> jax.Array:
         """Componentwise maximum."""
-        return jnp.max(jnp.abs(self.wrenches), 0, initial=0)
-
-    def admissible(self) -> jax.Array:
-        """Any wrenches do."""
-        return jnp.array(True)
+        return jnp.max(jnp.abs(self.wrenches), -2, initial=0)
 
 
 @jax.tree_util.register_dataclass
@@ -166,15 +158,12 @@ class Box:
         return _combine(self.half_extents, jnp.abs(directions))
 
     def extent(self) -> jax.Array:
-        """Half extents, turned."""
+        """Half extents, turned; negative ones stay negative."""
         if self.axes is None:
             return self.half_extents
-        turned = jnp.abs(self.axes)
-        return jnp.stack([sum(turned[r, c] * self.half_extents[h + c] for c in range(3)) for h in (0, 3) for r in range(3)])
-
-    def admissible(self) -> jax.Array:
-        """No negative extent."""
-        return (self.half_extents >= 0).all(0)
+        halves = self.half_extents.reshape(*self.half_extents.shape[:-1], 2, 3)
+        turned = jnp.einsum("...rc,...hc->...hr", jnp.abs(self.axes), halves).reshape(*self.batch_shape, 6)
+        return jnp.where((self.half_extents >= 0).all(-1, keepdims=True), turned, -1)
 
 
 @jax.tree_util.register_dataclass
@@ -205,11 +194,7 @@ class Ellipsoid:
 
     def extent(self) -> jax.Array:
         """Row norms."""
-        return safe_norm(self.shape_matrix, 1)
-
-    def admissible(self) -> jax.Array:
-        """Any matrix does."""
-        return jnp.array(True)
+        return safe_norm(self.shape_matrix, -1)
 
 
 @jax.tree_util.register_dataclass
@@ -241,8 +226,5 @@ class Ball:
 
     def extent(self) -> jax.Array:
         """Radii."""
-        return jnp.stack([*[self.force] * 3, *[self.torque] * 3])
-
-    def admissible(self) -> jax.Array:
-        """No negative radius."""
-        return (self.force >= 0) & (self.torque >= 0)
+        force, torque = jnp.broadcast_arrays(self.force, self.torque)
+        return jnp.stack([*[force] * 3, *[torque] * 3], -1)

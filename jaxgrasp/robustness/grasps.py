@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.arrays import as_float, broadcast_batch, fold
 from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.grasp_map import grasp_columns
@@ -44,6 +44,8 @@ class Grasps:
     """(*lanes), d, N."""
     terms: tuple[Term, ...]
     """The disturbance set, moments in N m; leaves may have lanes of size 1."""
+    extents: tuple[jax.Array, ...]
+    """(6, *lanes) each, the largest |w_i| of every term."""
     half: jax.Array | None
     """M with M M' = Q^-1, see `inverse_root`; None for Q = I."""
     vertex_halves: jax.Array | None
@@ -98,7 +100,9 @@ def over_grasps(
     dtype = contacts.positions.dtype
     terms, structure = jax.tree.flatten(disturbances.spread_over(batch) if disturbances.batch_shape else disturbances)
     lead = batch if disturbances.batch_shape else ()
+    spread = jax.tree.unflatten(structure, terms)
     leaves = {**own, **other, **{f"term {i}": (leaf, lead) for i, leaf in enumerate(terms)}}
+    leaves |= {f"extent {i}": (term.extent(), lead) for i, term in enumerate(spread.terms)}
 
     arguments, shared = {}, {}
     for name, (leaf, lead) in leaves.items():
@@ -111,9 +115,12 @@ def over_grasps(
 
     def run(raw: dict[str, jax.Array]) -> Any:
         terms = jax.tree.unflatten(structure, [raw[f"term {i}"] for i in range(structure.num_leaves)])
-        return kernel(_admit(raw, terms.terms))
+        extents = tuple(raw[f"extent {i}"] for i in range(len(terms.terms)))
+        return kernel(_admit(raw, terms.terms, extents))
 
-    out = map_lanes(run, arguments, shared, n)
+    # Library calls, as for the roots of Q, cannot be part of a compact tile.
+    compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
+    out = map_lanes(run, arguments, shared, n, compact=compact)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
@@ -150,7 +157,7 @@ def _per_vertex(compliance: Compliance, disturbances: DisturbanceSet, n: int) ->
     )
 
 
-def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...]) -> Grasps:
+def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[jax.Array, ...]) -> Grasps:
     """Check the data of every lane and replace what cannot be used."""
     positions, frames, active = raw["positions"], raw["frames"], raw["active"]
     n, dtype = positions.shape[0], positions.dtype
@@ -168,8 +175,8 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...]) -> Grasps:
     weights = _masked(raw.get("weights"), active)
     valid &= inverse_root(weights, n)[1]
     valid &= jnp.isfinite(raw["wrench"]).all(0) & (raw["reserve"] >= 0) & jnp.isfinite(raw["reserve"])
-    for term in terms:
-        valid &= jnp.isfinite(term.extent()).all(0) & term.admissible()
+    for extent in extents:
+        valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)
     margin = raw.get("margin")
     if margin is not None:
         valid &= (margin >= 0) & jnp.isfinite(margin)
@@ -178,7 +185,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...]) -> Grasps:
     there = active & valid
     positions = jnp.where(there, jnp.moveaxis(positions, 1, 0), 0)
     frames = jnp.where(there, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
-    mean = jnp.sum(positions**2, (0, 1)) / jnp.maximum(jnp.sum(there, 0), 1).astype(dtype)
+    mean = fold(jnp.add, fold(jnp.add, positions**2)) / jnp.maximum(fold(jnp.add, there.astype(dtype)), 1)
     length = jnp.sqrt(jnp.where(mean > 0, mean, 1))
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, raw["wrench"], 0)
@@ -193,6 +200,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...]) -> Grasps:
         wrench=wrench * units,
         reserve=jnp.where(valid, raw["reserve"], 0),
         terms=terms,
+        extents=extents,
         half=half,
         vertex_halves=vertex_halves,
         weights=weights,

@@ -85,7 +85,7 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     @fenced
     def scale_rows(cone: jax.Array, bound: jax.Array, tangential: jax.Array, normal: jax.Array, reserve: jax.Array) -> tuple:
         sigma = jnp.concatenate([cone / tangential, (bound / normal)[None]])
-        largest = jnp.max(sigma, (0, 1))
+        largest = fold(jnp.maximum, fold(jnp.maximum, sigma))
         undisturbed = largest == 0
         scale = 1 / jnp.where(undisturbed, 1, largest)
         sigma = jnp.where(undisturbed, present, sigma * scale)
@@ -96,14 +96,14 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         return sigma, h, scale, undisturbed
 
     sigma, h, scale, undisturbed = scale_rows(cone, bound, tangential, normal, grasps.reserve)
-    mean = jnp.sum(normal * present, 0) / jnp.maximum(jnp.sum(present, 0), 1)
+    mean = fold(jnp.add, normal * present) / jnp.maximum(fold(jnp.add, present), 1)
     mean = jnp.where(mean > 0, mean, 1)
     columns = grasps.columns * (jnp.stack([tangential, tangential, normal]) / mean)
     rows = row_basis(columns)
     wrench = grasps.wrench / mean
     coordinates, kept = rows.coordinates(wrench), rows.kept
-    largest = jnp.max(jnp.abs(wrench), 0)
-    outside = jnp.max(jnp.abs(coordinates) * (1 - kept), 0) > 10 * RANK_TOLERANCE[dtype.name] * largest
+    largest = fold(jnp.maximum, jnp.abs(wrench))
+    outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > 10 * RANK_TOLERANCE[dtype.name] * largest
     patterns = np.concatenate([pyramid_facets(cone_edges), [[0.0, 0.0, -1.0]]])
     return Program(
         blocks=Blocks(
@@ -123,12 +123,12 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         normal=normal,
         basis=rows,
         mean=mean,
-        rank=jnp.sum(basis.kept, 0).astype(jnp.int32),
+        rank=fold(jnp.add, basis.kept).astype(jnp.int32),
         doubtful=_doubtful(basis),
         undisturbed=undisturbed,
         disturbance_outside=reaches_outside(grasps, basis),
         wrench_outside=outside,
-        slippery=((grasps.friction <= 0) & (jnp.max(cone, 0) > 0)).any(0),
+        slippery=((grasps.friction <= 0) & (fold(jnp.maximum, cone) > 0)).any(0),
     )
 
 

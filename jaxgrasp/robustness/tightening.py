@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
@@ -199,11 +200,11 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
 def _effort(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
     """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
     weighed = forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
-    return 0.5 * jnp.sum(forces * weighed, (0, 1))
+    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed))
 
 
 def _largest(rows: tuple) -> jax.Array:
-    return jnp.max(jnp.abs(rows[0]), (0, 1))
+    return fold(jnp.maximum, fold(jnp.maximum, jnp.abs(rows[0])))
 
 
 def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Record) -> Solution:
@@ -219,7 +220,7 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     eye = jnp.eye(3, dtype=dtype)[..., None, None]
     weights = eye if grasps.weights is None else jnp.moveaxis(grasps.weights, 0, 2)
     hessian = weights * units[:, None] * units * blocks.present
-    largest = jnp.max(jnp.abs(hessian), (0, 1, 2))
+    largest = fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(hessian))))
     largest = jnp.where(largest > 0, largest, 1)
 
     # Between (21)'s answer and its start, which is deep inside the rows, but for those that the margin asks for.

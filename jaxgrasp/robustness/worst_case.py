@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import literal
+from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, Compliance, pseudo_inverse
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
@@ -72,7 +72,7 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, B
         def worse(reach: jax.Array, vertex: tuple) -> tuple[jax.Array, None]:
             half, wrench = vertex
             rows = directions(pseudo_inverse(grasps.columns, half)[0], grasps.friction, grasps.units)
-            return jnp.maximum(reach, jnp.sum(rows * wrench[:, None, None], 0)), None
+            return jnp.maximum(reach, fold(jnp.add, rows * wrench[:, None, None])), None
 
         reach = jnp.zeros((cone_edges + 1, *grasps.present.shape), grasps.present.dtype)
         reach, _ = lax.scan(worse, reach, (grasps.vertex_halves, grasps.terms[0].wrenches))
@@ -91,9 +91,9 @@ def reaches_outside(grasps: Grasps, basis: Basis) -> jax.Array:
     tolerance = 10 * RANK_TOLERANCE[length.dtype.name]
 
     def measure() -> jax.Array:
-        size = sum(jnp.max(term.extent() * grasps.units, 0) for term in grasps.terms)
+        size = sum(fold(jnp.maximum, extent * grasps.units) for extent in grasps.extents)
         outside = jnp.moveaxis(jnp.where(basis.kept[:, None] > 0, 0, basis.operations), 0, 1) * grasps.units[:, None]
         reach = support(grasps.terms, jnp.concatenate([outside, -outside], 1))
-        return jnp.max(reach, 0) > tolerance * size
+        return fold(jnp.maximum, reach) > tolerance * size
 
     return lax.cond(jnp.all(basis.kept > 0), lambda: jnp.zeros(lanes, bool), measure)

@@ -19,23 +19,25 @@ from jaxgrasp.fence import fences
 Tree = Any
 # Values of one row of a tile: its working set has to fit in the second-level cache.
 TILE = 256
+LOOSE_TILE = 1024
 LARGE_TILE = 1 << 17
 
 
-def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree, blocks: int) -> Tree:
+def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree, blocks: int, *, compact: bool) -> Tree:
     """Run a kernel over the leading axis of its arguments.
 
     Args:
         kernel: takes the tree of arguments with the lane axis last (size 1 where shared), returns a tree of arrays with the lane axis last.
         arguments: leaves (lanes, ...), or without the leading axis where shared.
         shared: like arguments, bool: the leaf is the same for all lanes.
+        compact: the kernel is free of library calls and large reductions, so that a tile can be one function on CPUs.
         blocks: how many blocks (contacts) a lane has, which sets the size of a tile.
 
     Returns:
         The kernel's tree, leaves (lanes, ...).
     """
     leaves, structure = jax.tree.flatten(arguments)
-    return _run(kernel, structure, tuple(jax.tree.leaves(shared)), blocks)(leaves)
+    return _run(kernel, structure, tuple(jax.tree.leaves(shared)), blocks if compact else 0)(leaves)
 
 
 def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int) -> Callable:
@@ -90,15 +92,20 @@ def _tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
-        tile, size = jax.jit(solve), min(1 << max(0, (TILE // blocks).bit_length() - 1), 64)
+        @jax.jit
+        def tile(parts: list[jax.Array]) -> tuple[Tree, list[jax.Array]]:
+            # XLA aborts where a parameter of such a function ends up unused, so each is handed on.
+            return solve(parts), [x.ravel()[0] for x in parts]
+
+        size = min(1 << max(0, (TILE // blocks).bit_length() - 1), 64) if blocks else LOOSE_TILE
 
         def one(parts: list[jax.Array]) -> Tree:
             with fences(True):
-                if lanes <= size:
+                if not blocks or lanes <= size:
                     return solve(parts)
                 # XLA's CPU backend then emits the tile as one function, free of the overhead it has for every operation.
                 with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-                    return tile(parts)
+                    return tile(parts)[0]
 
         return in_tiles(min(size, lanes), one)
 
