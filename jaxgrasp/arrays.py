@@ -51,7 +51,9 @@ def broadcast_batch(**batches: tuple[int, ...]) -> tuple[int, ...]:
         return jnp.broadcast_shapes(*batches.values())
     except ValueError:
         listed = ", ".join(f"{name} {shape}" for name, shape in batches.items())
-        raise ValueError(f"batch shapes do not broadcast: got {listed}; wanted leading axes that agree or are 1") from None
+        raise ValueError(
+            f"batch shapes do not broadcast: got {listed}; wanted leading axes that agree or are 1"
+        ) from None
 
 
 def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import ParamSpec, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
 P = ParamSpec("P")
@@ -46,6 +47,8 @@ def fenced(function: Callable[P, T]) -> Callable[P, T]:
 
 def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
     """`step(i, state)` for i = 0 .. count - 1: a loop where fences are on, where code size is compile time; else spelt out, for fusion."""
+    if count == 1:
+        return step(jnp.zeros((), jnp.int32), state)
     return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() else True)
 
 

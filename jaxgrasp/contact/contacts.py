@@ -66,7 +66,9 @@ class Contacts:
             )
         for name, value in (("friction", friction), ("max_force", max_force), ("active", present)):
             if value.ndim and value.shape[-1] != n_c:
-                raise ValueError(f"{name}: got shape {value.shape}, wanted a scalar or (*batch, {n_c}), one for each contact")
+                raise ValueError(
+                    f"{name}: got shape {value.shape}, wanted a scalar or (*batch, {n_c}), one for each contact"
+                )
         batch = broadcast_batch(
             positions=positions.shape[:-2],
             frames=frames.shape[:-3],

@@ -34,7 +34,9 @@ class DisturbanceSet:
             ValueError: another shape.
         """
         given = as_float("wrenches", wrenches, ("n_d", 6))
-        return cls(terms=(Vertices(wrenches=given if given.shape[-2] else jnp.zeros((*given.shape[:-2], 1, 6), given.dtype)),))
+        return cls(
+            terms=(Vertices(wrenches=given if given.shape[-2] else jnp.zeros((*given.shape[:-2], 1, 6), given.dtype)),)
+        )
 
     @classmethod
     def forces(cls, magnitude: ArrayLike = 1.0) -> "DisturbanceSet":
@@ -132,7 +134,7 @@ class DisturbanceSet:
 
 
 def support(terms: tuple[Term, ...], directions: jax.Array) -> jax.Array:
-    """h of a sum of sets, the sum of theirs; components leading, (6, ..., *lanes) -> (..., *lanes)."""
+    """H of a sum of sets, the sum of theirs; components leading, (6, ..., *lanes) -> (..., *lanes)."""
     total = jnp.zeros(directions.shape[1:], directions.dtype)
     for term in terms:
         total = total + term.support(directions)

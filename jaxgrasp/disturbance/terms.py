@@ -17,7 +17,6 @@ from jaxgrasp.arrays import safe_norm
 from jaxgrasp.fence import fenced
 
 
-
 class Term(Protocol):
     """A convex set of wrenches that contains the origin."""
 
@@ -193,8 +192,8 @@ class Ellipsoid:
         return safe_norm(jnp.stack([_combine(self.shape_matrix[:, c], directions) for c in range(6)]), 0)
 
     def extent(self) -> jax.Array:
-        """Row norms."""
-        return safe_norm(self.shape_matrix, -1)
+        """Row norms; not the safe norm, which hides NaN."""
+        return jnp.linalg.norm(self.shape_matrix, axis=-1)
 
 
 @jax.tree_util.register_dataclass
@@ -219,7 +218,7 @@ class Ball:
         return self
 
     def support(self, directions: jax.Array) -> jax.Array:
-        """force |a_f| + torque |a_m|."""
+        """Force |a_f| + torque |a_m|."""
         return _align(self.force, directions[0]) * safe_norm(directions[:3], 0) + _align(
             self.torque, directions[0]
         ) * safe_norm(directions[3:], 0)

@@ -29,16 +29,16 @@ def blocking_forces(
     Raises:
         ValueError: shapes that do not fit.
     """
+    return over_grasps(_blocking_kernel, contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
 
-    def kernel(grasps: Grasps) -> jax.Array:
-        scaled = grasps.terms[0].wrenches * grasps.units
-        if grasps.vertex_halves is None:
-            inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
-            forces = -jnp.einsum("aen...,de...->dna...", inverse, scaled)
-        else:
-            one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
-            forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
-        forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
-        return jnp.where(grasps.valid, forces, jnp.nan)
 
-    return over_grasps(kernel, contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
+def _blocking_kernel(grasps: Grasps) -> jax.Array:
+    scaled = grasps.terms[0].wrenches * grasps.units
+    if grasps.vertex_halves is None:
+        inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+        forces = -jnp.einsum("aen...,de...->dna...", inverse, scaled)
+    else:
+        one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
+        forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
+    forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
+    return jnp.where(grasps.valid, forces, jnp.nan)

@@ -1,5 +1,6 @@
 """From the public, batch-first arguments to the lanes that the kernels work on, with every check of the data."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,7 @@ from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.disturbance.terms import Box, Term, Vertices
+from jaxgrasp.disturbance.terms import Term, Vertices
 from jaxgrasp.solvers.lanes import map_lanes
 
 
@@ -52,24 +53,26 @@ class Grasps:
     """The same for each vertex of the disturbance set, along the leading axis."""
     weights: jax.Array | None
     """(n, 3, 3, *lanes), blocks of Q_0; None for I."""
+    weight_roots: jax.Array | None
+    """(3, 3, n, *lanes), R with R'R = Q_0."""
     margin: jax.Array | None
     """(*lanes), the margin that is asked for."""
 
 
 def over_grasps(
-    kernel: Callable[[Grasps], Any],
+    kernel: Callable[..., Any],
     contacts: Contacts,
     disturbances: DisturbanceSet,
-    *,
+    *options: int,
     required_wrench: Any = None,
     compliance: Any = None,
     cone_margin: Any = 0.0,
     effort_weights: Any = None,
     margin: Any = None,
 ) -> Any:
-    """Check shapes, run a kernel over all grasps of a batch and give its results the batch's shape.
+    """Check shapes, run `kernel(grasps, *options)` over all grasps of a batch and give its results the batch's shape.
 
-    The contacts' dtype is the precision of everything.
+    The contacts' dtype is the precision of everything. Compiled once for a kernel, its options and the shapes.
 
     Raises:
         ValueError: shapes or kinds of argument that do not fit.
@@ -78,6 +81,26 @@ def over_grasps(
         raise ValueError(f"contacts: got {type(contacts).__name__}, wanted jaxgrasp.Contacts")
     if not isinstance(disturbances, DisturbanceSet):
         raise ValueError(f"disturbances: got {type(disturbances).__name__}, wanted jaxgrasp.DisturbanceSet")
+    given = {
+        "required_wrench": required_wrench,
+        "compliance": compliance,
+        "cone_margin": cone_margin,
+        "effort_weights": effort_weights,
+        "margin": margin,
+    }
+    for name, value in given.items():
+        if value is not None and not isinstance(value, Compliance):
+            given[name] = as_float(name, value, ())
+    return _run(kernel, options, contacts, disturbances, given)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _run(
+    kernel: Callable[..., Any], options: tuple, contacts: Contacts, disturbances: DisturbanceSet, given: dict
+) -> Any:
+    """Lay the arguments out for `map_lanes`: which leaves have the batch axes, and which all grasps share."""
+    required_wrench, compliance, cone_margin = given["required_wrench"], given["compliance"], given["cone_margin"]
+    effort_weights, margin = given["effort_weights"], given["margin"]
     n = contacts.n_c
     own = {name: (getattr(contacts, name), contacts.batch_shape) for name in _CONTACT_LEAVES}
     other: dict[str, tuple[Any, tuple[int, ...]]] = {
@@ -116,7 +139,7 @@ def over_grasps(
     def run(raw: dict[str, jax.Array]) -> Any:
         terms = jax.tree.unflatten(structure, [raw[f"term {i}"] for i in range(structure.num_leaves)])
         extents = tuple(raw[f"extent {i}"] for i in range(len(terms.terms)))
-        return kernel(_admit(raw, terms.terms, extents))
+        return kernel(_admit(raw, terms.terms, extents), *options)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
     compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
@@ -125,7 +148,12 @@ def over_grasps(
 
 
 _CONTACT_LEAVES = ("positions", "frames", "friction", "max_force", "active")
-_PUBLIC = {"wrench": "required_wrench", "reserve": "cone_margin", "per_vertex": "compliance", "weights": "effort_weights"}
+_PUBLIC = {
+    "wrench": "required_wrench",
+    "reserve": "cone_margin",
+    "per_vertex": "compliance",
+    "weights": "effort_weights",
+}
 
 
 def _argument(name: str, value: Any, event: tuple[int, ...]) -> tuple[jax.Array, tuple[int, ...]]:
@@ -172,8 +200,11 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
         each = jnp.moveaxis(raw["per_vertex"], 0, -1)
         vertex_halves, usable = inverse_root(_masked(each, active[..., None]), n)
         vertex_halves, valid = jnp.moveaxis(vertex_halves, -1, 0), valid & usable.all(-1)
-    weights = _masked(raw.get("weights"), active)
-    valid &= inverse_root(weights, n)[1]
+    weights, weight_roots = _masked(raw.get("weights"), active), None
+    if weights is not None:
+        valid &= inverse_root(weights, n)[1]
+        sane = jnp.where(valid, weights, jnp.eye(3, dtype=dtype)[..., None])
+        weight_roots = jnp.moveaxis(jnp.linalg.cholesky(jnp.moveaxis(sane, (1, 2), (-1, -2))), (-1, -2), (0, 1))
     valid &= jnp.isfinite(raw["wrench"]).all(0) & (raw["reserve"] >= 0) & jnp.isfinite(raw["reserve"])
     for extent in extents:
         valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)
@@ -204,6 +235,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
         half=half,
         vertex_halves=vertex_halves,
         weights=weights,
+        weight_roots=weight_roots,
         margin=margin,
     )
 

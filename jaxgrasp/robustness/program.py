@@ -83,7 +83,9 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     normal = grasps.max_force
 
     @fenced
-    def scale_rows(cone: jax.Array, bound: jax.Array, tangential: jax.Array, normal: jax.Array, reserve: jax.Array) -> tuple:
+    def scale_rows(
+        cone: jax.Array, bound: jax.Array, tangential: jax.Array, normal: jax.Array, reserve: jax.Array
+    ) -> tuple:
         sigma = jnp.concatenate([cone / tangential, (bound / normal)[None]])
         largest = fold(jnp.maximum, fold(jnp.maximum, sigma))
         undisturbed = largest == 0

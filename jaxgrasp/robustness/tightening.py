@@ -18,20 +18,21 @@ from jaxgrasp.solvers.status import Status
 
 _SETTINGS = {
     "float64": interior_point.Settings(
-        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=False, safeguard=0.0
+        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=False, safeguard=0.0, patience=5
     ),
     "float32": interior_point.Settings(
-        tolerance=3e-6, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3
+        tolerance=3e-6, max_iterations=40, step_cap=1e-3, mu_floor=3e-8, equal_steps=True, safeguard=1e-3, patience=3
     ),
 }
 _EFFORT_SETTINGS = {
     "float64": interior_point.Settings(
-        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=0.0
+        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=0.0, patience=3
     ),
     "float32": interior_point.Settings(
-        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3
+        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=3
     ),
 }
+_REFINEMENTS = {"float64": 0, "float32": 1}
 # A gap that did not close to the tolerance still counts as solved below this one.
 _ACCEPTED_GAP = {"float64": 1e-7, "float32": 1e-4}
 
@@ -71,14 +72,11 @@ def largest_disturbance(
         grasp alone); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot tell).
     """
     pyramid_facets(cone_edges)
-
-    def kernel(grasps: Grasps) -> Solution:
-        return _solve_margin(grasps, scaled_program(grasps, cone_edges))[0]
-
     return over_grasps(
-        kernel,
+        _margin_kernel,
         contacts,
         disturbances,
+        cone_edges,
         required_wrench=required_wrench,
         compliance=compliance,
         cone_margin=cone_margin,
@@ -120,15 +118,11 @@ def least_effort(
         As in `largest_disturbance`; INFEASIBLE where the margin is above what (21) allows; INVALID_INPUT where it is negative or NaN.
     """
     pyramid_facets(cone_edges)
-
-    def kernel(grasps: Grasps) -> Solution:
-        program = scaled_program(grasps, cone_edges)
-        return _solve_effort(grasps, program, *_solve_margin(grasps, program))
-
     return over_grasps(
-        kernel,
+        _effort_kernel,
         contacts,
         disturbances,
+        cone_edges,
         required_wrench=required_wrench,
         compliance=compliance,
         cone_margin=cone_margin,
@@ -137,11 +131,20 @@ def least_effort(
     )
 
 
+def _margin_kernel(grasps: Grasps, cone_edges: int) -> Solution:
+    return _solve_margin(grasps, scaled_program(grasps, cone_edges))[0]
+
+
+def _effort_kernel(grasps: Grasps, cone_edges: int) -> Solution:
+    program = scaled_program(grasps, cone_edges)
+    return _solve_effort(grasps, program, *_solve_margin(grasps, program))
+
+
 def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     """(21) for lanes; also the scaled record, from which (22) starts."""
     dtype = program.rhs.dtype
-    settings = _SETTINGS[dtype.name]
-    problem = MarginProblem((program.blocks,), program.rhs, program.dropped, program.radius)
+    settings, refinements = _SETTINGS[dtype.name], _REFINEMENTS[dtype.name]
+    problem = MarginProblem((program.blocks,), program.rhs, program.dropped, program.radius, refinements)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     # Without a load, no forces at all are an answer with margin 0, exactly.
     idle = (outcome.record.lower < 0) & (program.rhs == 0).all(0) & (grasps.reserve == 0)
@@ -175,7 +178,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     margin = jnp.select([c for c, _, _ in decided], [jnp.full_like(low, m) for *_, m in decided], margin)
     upper = jnp.select([c for c, _, _ in decided], [jnp.full_like(low, m) for *_, m in decided], upper)
 
-    answered = grasps.valid & ~program.wrench_outside
+    answered = ~jnp.isnan(margin)
     forces = program.forces(record.x[0]) * program.blocks.present[:, None]
     scale = program.scale
     multipliers = record.z[0] * scale / program.row_units()
@@ -210,7 +213,7 @@ def _largest(rows: tuple) -> jax.Array:
 def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Record) -> Solution:
     """(22) for lanes, from what (21) left."""
     dtype, blocks = program.rhs.dtype, program.blocks
-    settings = _EFFORT_SETTINGS[dtype.name]
+    settings, refinements = _EFFORT_SETTINGS[dtype.name], _REFINEMENTS[dtype.name]
     sigma = jnp.where(program.undisturbed, 0, blocks.sigma)
     wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.margin / program.scale)
     reachable = grasps.margin <= first.upper_bound * (1 + settings.tolerance)
@@ -218,22 +221,24 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
 
     units = jnp.stack([program.tangential, program.tangential, program.normal])
     eye = jnp.eye(3, dtype=dtype)[..., None, None]
-    weights = eye if grasps.weights is None else jnp.moveaxis(grasps.weights, 0, 2)
-    hessian = weights * units[:, None] * units * blocks.present
-    largest = fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(hessian))))
+    # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
+    root = eye if grasps.weight_roots is None else grasps.weight_roots
+    root = root * units * blocks.present
+    largest = fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root))))
     largest = jnp.where(largest > 0, largest, 1)
 
     # Between (21)'s answer and its start, which is deep inside the rows, but for those that the margin asks for.
-    problem = MarginProblem((blocks,), program.rhs, program.dropped, program.radius)
+    problem = MarginProblem((blocks,), program.rhs, program.dropped, program.radius, refinements)
     centre = problem.start().x[0]
     attained = problem.attained(centre)
     share = (wanted - attained) / jnp.maximum(record.lower - attained, 1e-3)
     share = 0.5 * (1 + jnp.clip(share, 0, 1))
     problem = EffortProblem(
-        (blocks._replace(h=blocks.h - sigma * wanted, hessian=hessian / largest),),
+        (blocks._replace(h=blocks.h - sigma * wanted, hessian=root / largest),),
         program.rhs,
         program.dropped,
         program.radius,
+        refinements,
         tuple(share * x + (1 - share) * c for x, c in zip(record.x, centre, strict=True)),
     )
     active = grasps.valid & ~program.wrench_outside & held & (first.status != Status.INFEASIBLE)
@@ -249,11 +254,13 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     ).astype(jnp.int32)
     answered = active & jnp.isfinite(best.upper)
     hide = lambda x: jnp.where(answered, x, jnp.nan)  # noqa: E731
-    attained = MarginProblem((blocks._replace(sigma=sigma),), program.rhs, program.dropped, program.radius).attained(best.x)
+    attained = MarginProblem(
+        (blocks._replace(sigma=sigma),), program.rhs, program.dropped, program.radius, refinements
+    ).attained(best.x)
     attained = jnp.where(program.undisturbed, jnp.inf, attained * program.scale)
     attained = jnp.where(program.disturbance_outside | program.slippery, 0, attained)
     forces = program.forces(best.x[0]) * blocks.present[:, None]
-    multipliers = best.z[0] * largest / program.row_units()
+    multipliers = best.z[0] * largest**2 / program.row_units()
     return Solution(
         margin=hide(attained),
         upper_bound=first.upper_bound,
@@ -267,5 +274,5 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
         rank=program.rank,
         cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
         bound_multipliers=multipliers[-1],
-        wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * largest,
+        wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * largest**2,
     )

@@ -41,12 +41,13 @@ def worst_case(
     """
     pyramid_facets(cone_edges)
 
-    def kernel(grasps: Grasps) -> tuple[jax.Array, jax.Array]:
-        cone, bound, _ = worst_rows(grasps, cone_edges)
-        hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)  # noqa: E731
-        return hide(jnp.moveaxis(-cone, 0, 1)), hide(bound)
+    return over_grasps(_worst_kernel, contacts, disturbances, cone_edges, compliance=compliance)
 
-    return over_grasps(kernel, contacts, disturbances, compliance=compliance)
+
+def _worst_kernel(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array]:
+    cone, bound, _ = worst_rows(grasps, cone_edges)
+    hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)  # noqa: E731
+    return hide(jnp.moveaxis(-cone, 0, 1)), hide(bound)
 
 
 def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, Basis]:

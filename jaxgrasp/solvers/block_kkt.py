@@ -6,7 +6,7 @@ With blocks x_i (three forces of a contact, or one bounded actuator effort), a s
     sum_i E_i x_i = b                  (a static number of equality rows),
 
 `MarginProblem` maximises lambda, `EffortProblem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the same for every block of a
-group, so they are never stored. The Newton system is reduced block by block (Cholesky of k x k), then lambda, then the
+group, so they are never stored. The Newton system is reduced block by block (k x k), then lambda, then the
 equality rows: the cost is linear in the number of blocks.
 
 Both certify their answers at every step: any x with E x = b attains lambda_lo = min (h - A x) / sigma; any z >= 0 scaled to sum sigma z = 1 proves
@@ -36,7 +36,7 @@ class Blocks(NamedTuple):
     sigma: (m, n, *lanes), the border column, >= 0; zero where absent.
     h: (m, n, *lanes), right-hand sides; one where absent.
     present: (n, *lanes), 1 or 0.
-    hessian: (k, k, n, *lanes), H_i, for `EffortProblem`.
+    hessian: (k, k, n, *lanes), a root of H_i (H_i = root' root), for `EffortProblem`.
     start: (k,), where the unknowns of a block start.
     """
 
@@ -60,18 +60,19 @@ class Record(NamedTuple):
 
 
 class _BlockFactor(NamedTuple):
-    """Cholesky of P = A'WA (+ H) and what is solved with it; lists run over the k unknowns."""
+    """L with L L' = P = A'WA (+ H) and what is solved with it; lists run over the k unknowns."""
 
     below: list[jax.Array]  # L10, L20, L21, each (n, *lanes)
     inverse: list[jax.Array]  # 1 / diag(L)
     columns: list[jax.Array]  # L^-1 E', each (eq, n, *lanes)
     theta: list[jax.Array]  # L^-1 p, p = A'W sigma
-    phi: jax.Array | None  # P^-1 p, (k, n, *lanes)
+    lean: jax.Array | None  # (n, *lanes), what of sigma'W sigma the unknowns of the block cannot make up for
 
 
 class _Factors(NamedTuple):
     blocks: list[_BlockFactor]
     root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of the equality rows' matrix
+    weights: Rows
     border: jax.Array | None  # inverse pivot of lambda
     v: jax.Array | None  # (eq, *lanes), lambda's column in the equality rows
 
@@ -158,12 +159,14 @@ class BlockProblem:
     rhs: (eq, *lanes), b; zero in rows that are zero in E.
     dropped: (eq, *lanes), 1 for the equality rows that are zero, else 0.
     radius: how |x|_inf at the optimum grows with a negative lambda: at most 1 + radius * max(0, -lambda).
+    refinements: steps of iterative refinement of every Newton direction.
     """
 
     groups: tuple[Blocks, ...]
     rhs: jax.Array
     dropped: jax.Array
     radius: float
+    refinements: int
     bordered = True
 
     @property
@@ -206,7 +209,7 @@ class BlockProblem:
         blocks = [self._factor_block(g, w) for g, w in zip(self.groups, weights, strict=True)]
 
         @fenced
-        def reduce(blocks: list[_BlockFactor], weights: Rows) -> tuple:
+        def reduce(blocks: list[_BlockFactor]) -> tuple:
             columns = [f.columns for f in blocks]
 
             def row(r: jax.Array) -> jax.Array:
@@ -216,9 +219,8 @@ class BlockProblem:
             if not self.bordered:
                 return matrix, None, None
             sides = [_over_blocks(c * -t, 1) for f in blocks for c, t in zip(f.columns, f.theta, strict=True)]
-            # As a sum of squares: sigma'W sigma - p'P^-1 p would cancel near the optimum.
-            lean = [g.sigma - _apply(g, f.phi) for g, f in zip(self.groups, blocks, strict=True)]
-            kappa = fold(jnp.add, [_total(w * e * e) for w, e in zip(weights, lean, strict=True)])
+            # A sum of squares: sigma'W sigma - p'P^-1 p would cancel near the optimum.
+            kappa = fold(jnp.add, [fold(jnp.add, f.lean) for f in blocks])
             return matrix, fold(jnp.add, sides), 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
 
         @fenced
@@ -227,49 +229,51 @@ class BlockProblem:
             matrix = matrix + eye * self.dropped
             return matrix if v is None else matrix + v[:, None] * (v * border)
 
-        matrix, v, border = reduce(blocks, weights)
-        return _Factors(blocks, _inverse_root(complete(matrix, v, border)), border, v)
+        matrix, v, border = reduce(blocks)
+        return _Factors(blocks, _inverse_root(complete(matrix, v, border)), weights, border, v)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
+        """Orthogonalise sqrt(W) [A, sigma] column by column: A'WA itself would square its condition, too much for float32."""
         k = g.patterns.shape[1]
-        pairs = [(i, j) for i in range(k) for j in range(i + 1)]
+        root = jnp.sqrt(weights)
+        columns = [root * _spread(g.patterns[:, a], root) for a in range(k)]
+        if g.hessian is not None:
+            columns = [jnp.concatenate([c, g.hessian[:, a]]) for a, c in enumerate(columns)]
+        if self.bordered:
+            columns.append(root * g.sigma)
 
         @fenced
-        def weigh(w: jax.Array) -> jax.Array:
-            products = jnp.stack([g.patterns[:, i] * g.patterns[:, j] for i, j in pairs])
-            return each(lambda p: fold(jnp.add, _spread(p, w) * w), products)
+        def share(column: jax.Array, others: list[jax.Array]) -> tuple:
+            square = fold(jnp.add, column * column)
+            inverse = jax.lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny) + (1 - g.present))
+            return inverse, [fold(jnp.add, column * other) * inverse for other in others]
 
         @fenced
-        def cholesky(gram: jax.Array) -> tuple:
-            below, inverse = [], []
-            for index, (i, j) in enumerate(pairs):
-                entry = gram[index] if g.hessian is None else gram[index] + g.hessian[i, j]
-                floor = jnp.finfo(entry.dtype).eps * entry
-                for l in range(j):
-                    entry = entry - below[i * (i - 1) // 2 + l] * below[j * (j - 1) // 2 + l]
-                if i == j:
-                    inverse.append(jax.lax.rsqrt(jnp.maximum(entry, floor) + (1 - g.present)))
-                else:
-                    below.append(entry * inverse[j])
-            return below, inverse
+        def remove(column: jax.Array, inverse: jax.Array, others: list[jax.Array], shares: list[jax.Array]) -> list:
+            unit = column * inverse
+            return [other - part * unit for other, part in zip(others, shares, strict=True)]
 
-        @fenced
-        def solve(w: jax.Array, below: list, inverse: list) -> tuple:
-            columns = _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)])
-            if not self.bordered:
-                return columns, [], None
-            theta = _substitute_down(below, inverse, list(_adjoint(g, w * g.sigma)))
-            return columns, theta, jnp.stack(_substitute_up(below, inverse, theta))
-
-        below, inverse = cholesky(weigh(weights))
-        return _BlockFactor(below, inverse, *solve(weights, below, inverse))
+        inverse, shares = [], []
+        for _ in range(k):
+            column, *others = columns
+            own, parts = share(column, others)
+            columns = remove(column, own, others, parts)
+            inverse.append(own)
+            shares.append(parts)
+        below = [shares[j][i - j - 1] for i in range(k) for j in range(i)]
+        theta = [parts[-1] for parts in shares] if self.bordered else []
+        lean = fenced(lambda c: fold(jnp.add, c * c))(columns[0]) if self.bordered else None
+        reduced = fenced(lambda below, inverse: _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
+        return _BlockFactor(below, inverse, reduced(below, inverse), theta, lean)
 
     def _newton(self, factors: _Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
         """Solve [P p E'; p' hll 0; E 0 0] (dx, dlambda, dy) = (rhs_x, rhs_lambda, rhs_y)."""
 
         @fenced
         def eliminate(factors: _Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
-            reduced = [_substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)]
+            reduced = [
+                _substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)
+            ]
             pairs = [
                 (c, t, a)
                 for f, r in zip(factors.blocks, reduced, strict=True)
@@ -313,7 +317,7 @@ class MarginProblem(BlockProblem):
     """max lambda; x is (blocks, lambda). Record: `lower` is attained by `x`, `upper` is certified by (y, z), sum sigma z = 1."""
 
     def attained(self, x: Rows) -> jax.Array:
-        """min (h - A x) / sigma, the lambda that x attains when E x = b; -inf where a row with sigma = 0 is violated."""
+        """Min (h - A x) / sigma, the lambda that x attains when E x = b; -inf where a row with sigma = 0 is violated."""
         parts = []
         for g, x_g in zip(self.groups, x, strict=True):
             info = jnp.finfo(g.h.dtype)
@@ -326,7 +330,9 @@ class MarginProblem(BlockProblem):
     def start(self) -> Iterate:
         """Closed form: light forces that meet E x = b, a lambda well below what they attain, multipliers with A'z = 0."""
         blocks = self.project(
-            tuple(jnp.broadcast_to(_spread(g.start, g.columns[0]), g.columns.shape[1:]) * g.present for g in self.groups)
+            tuple(
+                jnp.broadcast_to(_spread(g.start, g.columns[0]), g.columns.shape[1:]) * g.present for g in self.groups
+            )
         )
 
         @fenced
@@ -349,7 +355,9 @@ class MarginProblem(BlockProblem):
             s, z = [], []
             for g, slack in zip(self.groups, slacks, strict=True):
                 kept = jnp.where(g.present > 0, jnp.maximum(slack, floor), 1)
-                balance = jnp.concatenate([jnp.ones(kept.shape[0] - 1, kept.dtype), -jnp.sum(g.patterns[:-1, -1:], 0) / g.patterns[-1, -1:]])
+                balance = jnp.concatenate(
+                    [jnp.ones(kept.shape[0] - 1, kept.dtype), -jnp.sum(g.patterns[:-1, -1:], 0) / g.patterns[-1, -1:]]
+                )
                 mean = fold(jnp.add, kept[:-1]) / (kept.shape[0] - 1)
                 s.append(kept)
                 z.append(_spread(balance, kept) * (g.present / mean))
@@ -376,14 +384,29 @@ class MarginProblem(BlockProblem):
         """See `interior_point.Problem`."""
 
         @fenced
-        def right_hand_side(dual: Rows, pull: jax.Array, shift: Rows) -> tuple:
-            rhs_x = tuple(-d - _adjoint(g, e) for g, d, e in zip(self.groups, dual, shift, strict=True))
-            return rhs_x, -pull - fold(jnp.add, [_total(g.sigma * e) for g, e in zip(self.groups, shift, strict=True)])
+        def lacking(weights: Rows, dx: Rows, dlambda: jax.Array, dy: jax.Array, rows: Rows) -> tuple:
+            """The right-hand side, less what the direction found so far makes of the left."""
+            dual, pull = residuals.dual
+            shifts = tuple(e + w * r for e, w, r in zip(shift, weights, rows, strict=True))
+            rhs_x = tuple(
+                -d - _adjoint(g, e) - t
+                for g, d, e, t in zip(self.groups, dual, shifts, self.pull_back(dy), strict=True)
+            )
+            rhs_lambda = -pull - fold(jnp.add, [_total(g.sigma * e) for g, e in zip(self.groups, shifts, strict=True)])
+            return rhs_x, rhs_lambda, -residuals.primal - self.equality(dx)
 
-        rhs_x, rhs_lambda = right_hand_side(*residuals.dual, shift)
-        dx, dlambda, dy = self._newton(factors, rhs_x, rhs_lambda, -residuals.primal)
-        rows = fenced(lambda dx, dl: tuple(_apply(g, d) + g.sigma * dl for g, d in zip(self.groups, dx, strict=True)))(dx, dlambda)
-        return (dx, dlambda), dy, rows
+        @fenced
+        def change(dx: Rows, dlambda: jax.Array) -> Rows:
+            return tuple(_apply(g, d) + g.sigma * dlambda for g, d in zip(self.groups, dx, strict=True))
+
+        def improve(_: jax.Array, state: tuple) -> tuple:
+            (dx, dlambda), dy, rows = state
+            more_x, more_lambda, more_y = self._newton(factors, *lacking(factors.weights, dx, dlambda, dy, rows))
+            dx = tuple(d + m for d, m in zip(dx, more_x, strict=True))
+            return (dx, dlambda + more_lambda), dy + more_y, change(dx, dlambda + more_lambda)
+
+        zero = jax.tree.map(jnp.zeros_like, (residuals.dual, residuals.primal, residuals.rows))
+        return repeat(1 + self.refinements, improve, zero)
 
     def first_record(self) -> Record:
         """Nothing is known."""
@@ -394,7 +417,9 @@ class MarginProblem(BlockProblem):
     def gap_scale(self, record: Record) -> jax.Array:
         """Gaps count relative to max(1, |lambda|); where no x attains anything, a negative upper bound says all there is to know."""
         hopeless = jnp.isinf(record.lower) & (record.upper < -1e-6)
-        return jnp.where(hopeless, jnp.inf, jnp.maximum(1, jnp.where(jnp.isinf(record.lower), 1, jnp.abs(record.lower))))
+        return jnp.where(
+            hopeless, jnp.inf, jnp.maximum(1, jnp.where(jnp.isinf(record.lower), 1, jnp.abs(record.lower)))
+        )
 
     def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
         """Both bounds."""
@@ -423,7 +448,7 @@ class MarginProblem(BlockProblem):
 class EffortProblem(BlockProblem):
     """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at. Record: `upper` is attained by `x`, `lower` is certified by (y, z).
 
-    H is scaled so that its largest entry is 1. Without lambda the blocks' bounds are |x|_inf <= 1.
+    H is scaled so that its entries are 1 at most. Without lambda the blocks' bounds are |x|_inf <= 1.
 
     guess: where to start, meeting E x = b about, well inside the rows if possible.
     """
@@ -443,7 +468,8 @@ class EffortProblem(BlockProblem):
         return Iterate(blocks, -self.equality(pull), s, z)
 
     def _gradient(self, g: Blocks, x: jax.Array) -> jax.Array:
-        return fold(jnp.add, g.hessian * x[:, None])
+        half = fold(jnp.add, jnp.moveaxis(g.hessian * x, 1, 0))
+        return fold(jnp.add, g.hessian * half[:, None])
 
     def residuals(self, iterate: Iterate) -> Residuals:
         """Of stationarity, of E x = b and of the rows."""
@@ -457,9 +483,21 @@ class EffortProblem(BlockProblem):
 
     def solve(self, factors: _Factors, residuals: Residuals, shift: Rows) -> tuple:
         """See `interior_point.Problem`."""
-        rhs = tuple(-d - _adjoint(g, e) for g, d, e in zip(self.groups, residuals.dual, shift, strict=True))
-        dx, _, dy = self._newton(factors, rhs, None, -residuals.primal)
-        return dx, dy, tuple(_apply(g, d) for g, d in zip(self.groups, dx, strict=True))
+
+        def improve(_: jax.Array, state: tuple) -> tuple:
+            dx, dy, rows = state
+            rhs = tuple(
+                -d - _adjoint(g, e + w * r) - self._gradient(g, x) - t
+                for g, d, e, w, r, x, t in zip(
+                    self.groups, residuals.dual, shift, factors.weights, rows, dx, self.pull_back(dy), strict=True
+                )
+            )
+            more_x, _, more_y = self._newton(factors, rhs, None, -residuals.primal - self.equality(dx))
+            dx = tuple(d + m for d, m in zip(dx, more_x, strict=True))
+            return dx, dy + more_y, tuple(_apply(g, d) for g, d in zip(self.groups, dx, strict=True))
+
+        zero = jax.tree.map(jnp.zeros_like, (residuals.dual, residuals.primal, residuals.rows))
+        return repeat(1 + self.refinements, improve, zero)
 
     def first_record(self) -> Record:
         """Nothing is known."""
@@ -471,14 +509,19 @@ class EffortProblem(BlockProblem):
         return jnp.maximum(jnp.where(jnp.isinf(record.upper), 0, record.upper), 1e-3)
 
     def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
-        """Both bounds; a point counts as attained when it misses the rows by rounding alone."""
+        """Both bounds; what a point misses the rows by is charged at the rows' multipliers, so that no effort is saved by it."""
         x = fenced(self.project)(iterate.x)
-        missed = fold(jnp.maximum, [-_least(g.h - _apply(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)])
-        value = lambda x: 0.5 * fold(  # noqa: E731
-            jnp.add, [_total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
+        value = lambda x: (
+            0.5
+            * fold(  # noqa: E731
+                jnp.add, [_total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
+            )
         )
+        over = [jnp.maximum(_apply(g, x_g) - g.h, 0) for g, x_g in zip(self.groups, x, strict=True)]
+        missed = fold(jnp.maximum, [-_least(-o) for o in over])
+        charge = fold(jnp.add, [_total(o * z) for o, z in zip(over, iterate.z, strict=True)])
         near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
-        upper = jnp.where(missed <= near, value(x), jnp.inf)
+        upper = jnp.where(missed <= near, value(x) + charge, jnp.inf)
         held = fold(jnp.add, [_total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
         lost = fold(jnp.add, [_total(jnp.abs(d)) for d in residuals.dual])
         lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - lost

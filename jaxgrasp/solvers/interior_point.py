@@ -196,7 +196,12 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
 
 
 def _predict_correct(
-    problem: Problem, settings: Settings, iterate: Iterate, residuals: Residuals, mu: jax.Array, inverse_count: jax.Array
+    problem: Problem,
+    settings: Settings,
+    iterate: Iterate,
+    residuals: Residuals,
+    mu: jax.Array,
+    inverse_count: jax.Array,
 ) -> tuple[Iterate, jax.Array]:
     """One step; returns the new iterate and its complementarity, NaN where the step is unusable."""
     lanes, present = len(problem.lanes), problem.present
@@ -226,7 +231,9 @@ def _predict_correct(
         return ds, dz, primal, dual
 
     @fenced
-    def correct(iterate: Iterate, affine: Iterate, primal: jax.Array, dual: jax.Array, mu: jax.Array, inverse_s: Tree) -> Tree:
+    def correct(
+        iterate: Iterate, affine: Iterate, primal: jax.Array, dual: jax.Array, mu: jax.Array, inverse_s: Tree
+    ) -> Tree:
         """The corrector's shift: aim at sigma mu and make up for the second-order term ds dz."""
         primal, dual = 1 / jnp.maximum(primal, 1), 1 / jnp.maximum(dual, 1)
         reached = jax.tree.map(

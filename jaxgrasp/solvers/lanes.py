@@ -20,6 +20,8 @@ Tree = Any
 # Values of one row of a tile: its working set has to fit in the second-level cache.
 TILE = 256
 LOOSE_TILE = 1024
+# XLA's CPU backend cuts operations on more than half a megabyte in parallel tasks, which it cannot do inside a tile.
+LARGEST_LEAF = 1 << 15
 LARGE_TILE = 1 << 17
 
 
@@ -37,6 +39,13 @@ def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree, blo
         The kernel's tree, leaves (lanes, ...).
     """
     leaves, structure = jax.tree.flatten(arguments)
+    if any(x.size == 0 for x in leaves):
+        one = [
+            x if s else jnp.zeros((1, *x.shape[1:]), x.dtype)
+            for x, s in zip(leaves, jax.tree.leaves(shared), strict=True)
+        ]
+        shapes = jax.eval_shape(_run(kernel, structure, tuple(jax.tree.leaves(shared)), 0), one)
+        return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), shapes)
     return _run(kernel, structure, tuple(jax.tree.leaves(shared)), blocks if compact else 0)(leaves)
 
 
@@ -67,9 +76,7 @@ def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int
     return run
 
 
-def _tiled(
-    kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int, leaves: list[jax.Array]
-) -> Tree:
+def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int, leaves: list[jax.Array]) -> Tree:
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
 
     def solve(parts: list[jax.Array]) -> Tree:
@@ -97,11 +104,14 @@ def _tiled(
             # XLA aborts where a parameter of such a function ends up unused, so each is handed on.
             return solve(parts), [x.ravel()[0] for x in parts]
 
-        size = min(1 << max(0, (TILE // blocks).bit_length() - 1), 64) if blocks else LOOSE_TILE
+        size = min(1 << max(0, (TILE // max(blocks, 1)).bit_length() - 1), 64)
+        largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
+        compact = blocks > 0 and lanes > size and largest <= LARGEST_LEAF
+        size = size if blocks and largest <= LARGEST_LEAF else LOOSE_TILE
 
         def one(parts: list[jax.Array]) -> Tree:
             with fences(True):
-                if not blocks or lanes <= size:
+                if not compact:
                     return solve(parts)
                 # XLA's CPU backend then emits the tile as one function, free of the overhead it has for every operation.
                 with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
