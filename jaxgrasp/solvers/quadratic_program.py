@@ -1,0 +1,202 @@
+"""Quadratic and linear programs of any small dense data, in batch, with certificates where there is no solution."""
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+
+from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.solvers import interior_point
+from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program, largest
+from jaxgrasp.solvers.interior_point import Iterate, Settings
+from jaxgrasp.solvers.status import Status
+
+_EQUILIBRATIONS = 10
+_MAX_ITERATIONS = 60
+# Steps without progress at the start, while tau finds its size, are common.
+_PATIENCE = 8
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class QPSolution:
+    """What `solve_qp` found; every field has the leading axes of the batch.
+
+    Where a field has no meaning for the status it is NaN, or infinite for `objective` and the residuals.
+    """
+
+    x: jax.Array
+    """(*batch, n): the minimiser; if UNBOUNDED a ray with q'x = -1, Px = 0, Ax = 0 and Gx <= 0."""
+    s: jax.Array
+    """(*batch, m): slacks h - Gx >= 0; if UNBOUNDED those of the ray, -Gx."""
+    y: jax.Array
+    """(*batch, p): multipliers of Ax = b; if INFEASIBLE part of a certificate (y, z): A'y + G'z = 0, b'y + h'z = -1."""
+    z: jax.Array
+    """(*batch, m): multipliers of Gx <= h, z >= 0; if INFEASIBLE part of that certificate."""
+    objective: jax.Array
+    """(*batch,): 1/2 x'Px + q'x; inf if INFEASIBLE, -inf if UNBOUNDED."""
+    status: jax.Array
+    """(*batch,): integers of `Status`; MAX_ITERATIONS where the best point found is not good enough."""
+    primal_residual: jax.Array
+    """(*batch,): max |Ax - b|, |Gx + s - h|; of the ray, max |Px|, |Ax|, |Gx + s|."""
+    dual_residual: jax.Array
+    """(*batch,): max |Px + q + A'y + G'z|; of the certificate r = max |A'y + G'z|: |x|_1 < 1/r is infeasible."""
+    gap: jax.Array
+    """(*batch,): |x'Px + q'x + b'y + h'z|."""
+    iterations: jax.Array
+    """(*batch,): steps taken."""
+
+
+def _typical(v: jax.Array) -> jax.Array:
+    """Geometric mean of the entries that are not zero, which a few huge ones do not drag along; 1 if none."""
+    nonzero = v != 0
+    logs = jnp.where(nonzero, jnp.log(jnp.abs(jnp.where(nonzero, v, 1))), 0)
+    return jnp.exp(jnp.sum(logs) / jnp.maximum(jnp.sum(nonzero, dtype=v.dtype), 1))
+
+
+def _equilibrated(program: Program) -> tuple[Program, Iterate]:
+    """Ruiz's scaling: rows and columns of the KKT matrix of largest entry 1, q, b and h of order 1.
+
+    Returns the scaled program and the factors that take its x, y, s and z back.
+    """
+    P, q, A, b, G, h = program
+    (p, n), m = A.shape, h.size
+    rows = jnp.concatenate([A, G])
+    matrix = jnp.block([[P, rows.T], [rows, jnp.zeros((p + m, p + m), P.dtype)]])
+
+    def equilibrate(_: int, scale: jax.Array) -> jax.Array:
+        largest = jnp.max(jnp.abs(matrix) * scale * scale[:, None], 1)
+        return scale / jnp.sqrt(jnp.where(largest > 0, largest, 1))
+
+    scale = lax.fori_loop(0, _EQUILIBRATIONS, equilibrate, jnp.ones(n + p + m, P.dtype))
+    d, e, f = scale[:n], scale[n : n + p], scale[n + p :]
+    cost, size = 1 / _typical(q * d), 1 / _typical(jnp.concatenate([b * e, h * f]))
+    scaled = Program(
+        P * d * d[:, None] * (cost / size),
+        q * d * cost,
+        A * d * e[:, None],
+        b * e * size,
+        G * d * f[:, None],
+        h * f * size,
+    )
+    return scaled, Iterate(d / size, e / cost, 1 / (f * size), f / cost)
+
+
+def _solve_one(program: Program) -> QPSolution:
+    constants = CONSTANTS[program.q.dtype.name]
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in program]))
+    P = (program.P + program.P.T) / 2
+    # Rounding in the caller's P may leave it that far from positive semidefinite.
+    slack = 16 * P.shape[0] * jnp.finfo(P.dtype).eps * jnp.where(jnp.any(P != 0), largest(P), 1)
+    shifted = jnp.where(finite, P / slack, 0) + jnp.eye(P.shape[0], dtype=P.dtype)
+    valid = finite & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
+    program = Program(*(jnp.where(valid, v, 0) for v in program._replace(P=P)))
+    scaled, back = _equilibrated(program)
+    settings = Settings(
+        constants.tolerance, _MAX_ITERATIONS, constants.step_cap, constants.mu_floor, True, 0.0, _PATIENCE
+    )
+    outcome = interior_point.solve(Embedding(scaled, constants), settings, valid)
+    record, iterate = outcome.record, outcome.record.iterate
+    found = jnp.where(record.error <= constants.accept, record.shows, int(Status.MAX_ITERATIONS))
+    status = jnp.where(valid, found, int(Status.INVALID_INPUT))
+    unscaled = iterate._replace(s=iterate.s[:-1], z=iterate.z[:-1])
+    return _answer(program, Iterate(*map(jnp.multiply, unscaled, back)), iterate.z[-1], status, outcome.iterations)
+
+
+def _answer(program: Program, iterate: Iterate, tau: jax.Array, status: jax.Array, iterations: jax.Array) -> QPSolution:
+    """The iterate divided by tau, or the certificate that it is, with residuals in the caller's units."""
+    P, q, A, b, G, h = program
+    none, ray, valid = status == Status.INFEASIBLE, status == Status.UNBOUNDED, status != Status.INVALID_INPUT
+    shown = ~none & ~ray & valid
+    # A certificate is measured by b'y + h'z or q'x; neither touches the numbers of the other.
+    x, s = (v / jnp.where(ray, -q @ iterate.x, tau) for v in (iterate.x, iterate.s))
+    y, z = (v / jnp.where(none, -b @ iterate.y - h @ iterate.z, tau) for v in (iterate.y, iterate.z))
+    Px, pull = P @ x, A.T @ y + G.T @ z
+    primal = jnp.maximum(largest(A @ x - jnp.where(ray, 0, b)), largest(G @ x + s - jnp.where(ray, 0, h)))
+    dual = largest(jnp.where(none, 0, Px + q) + pull)
+    infinite = jnp.asarray(jnp.inf, q.dtype)
+    value = jnp.where(none, infinite, jnp.where(ray, -infinite, x @ Px / 2 + q @ x))
+    with_x, with_y = valid & ~none, valid & ~ray
+    return QPSolution(
+        x=jnp.where(with_x, x, jnp.nan),
+        s=jnp.where(with_x, s, jnp.nan),
+        y=jnp.where(with_y, y, jnp.nan),
+        z=jnp.where(with_y, z, jnp.nan),
+        objective=jnp.where(valid, value, jnp.nan),
+        status=status,
+        primal_residual=jnp.where(with_x, jnp.where(ray, jnp.maximum(primal, largest(Px)), primal), infinite),
+        dual_residual=jnp.where(with_y, dual, infinite),
+        gap=jnp.where(shown, jnp.abs(x @ Px + q @ x + b @ y + h @ z), infinite),
+        iterations=iterations,
+    )
+
+
+def solve_qp(
+    P: ArrayLike | None,
+    q: ArrayLike,
+    A: ArrayLike | None = None,
+    b: ArrayLike | None = None,
+    G: ArrayLike | None = None,
+    h: ArrayLike | None = None,
+) -> QPSolution:
+    """Solve small dense quadratic programs, each lane of a batch to its own optimum or certificate.
+
+    Minimises 1/2 x'Px + q'x over A x = b and G x <= h. Rows may be dependent, duplicated or zero (rows 0 x = 0 and
+    0 x <= 1 pad ragged batches). Derivatives are not provided yet. A step costs O((m + n) n^2).
+
+    Args:
+        P: (*batch, n, n), positive semidefinite; only its symmetric part counts. None: a linear program.
+        q: (*batch, n).
+        A: (*batch, p, n), or None with b.
+        b: (*batch, p).
+        G: (*batch, m, n), or None with h.
+        h: (*batch, m), finite.
+
+    Returns:
+        A `QPSolution`. The leading axes of all arguments broadcast.
+
+    Raises:
+        ValueError: shapes that do not fit, one of a pair missing, or a dtype other than real numbers (tracing time).
+
+    Status:
+        SOLVED where every residual is below 1e-7 (float32: 5e-5) of 1 plus its own terms, in equilibrated units;
+        INFEASIBLE and UNBOUNDED with a certificate as exact as that; MAX_ITERATIONS with the best point otherwise;
+        INVALID_INPUT for data that are not finite, or P that is not positive semidefinite.
+    """
+    q = as_float("q", q, ("n",))
+    n = q.shape[-1]
+    P = jnp.zeros((n, n), q.dtype) if P is None else as_float("P", P, (n, n))
+    rows = [*_pair("A", A, "b", b, n, q.dtype), *_pair("G", G, "h", h, n, q.dtype)]
+    dtype = jnp.result_type(P, q, *rows)
+    if dtype.name not in CONSTANTS:
+        raise ValueError(f"P, q, A, b, G, h: got dtype {dtype.name} together, wanted float32 or float64")
+    program = Program(P, q, *rows)
+    events = (2, 1, 2, 1, 2, 1)
+    shapes = {name: v.shape[: v.ndim - k] for name, v, k in zip(Program._fields, program, events, strict=True)}
+    batch = broadcast_batch(**shapes)
+    lanes = Program(
+        *(
+            jnp.broadcast_to(v, (*batch, *v.shape[v.ndim - k :]))
+            .reshape(math.prod(batch), *v.shape[v.ndim - k :])
+            .astype(dtype)
+            for v, k in zip(program, events, strict=True)
+        )
+    )
+    solution = jax.vmap(_solve_one)(lanes)
+    return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solution)
+
+
+def _pair(
+    rows_name: str, rows: ArrayLike | None, side_name: str, side: ArrayLike | None, n: int, dtype: jnp.dtype
+) -> tuple[jax.Array, jax.Array]:
+    """A matrix of rows and its right-hand side, both or none."""
+    if (rows is None) != (side is None):
+        missing, given = (rows_name, side_name) if rows is None else (side_name, rows_name)
+        raise ValueError(f"{missing}: got None with {given} given, wanted both or none")
+    if rows is None or side is None:
+        return jnp.zeros((0, n), dtype), jnp.zeros((0,), dtype)
+    matrix = as_float(rows_name, rows, ("rows", n))
+    return matrix, as_float(side_name, side, (matrix.shape[-2],))
