@@ -1,0 +1,1 @@
+"""Timings of the library and of what one would use instead."""

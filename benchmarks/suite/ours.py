@@ -1,0 +1,97 @@
+"""The package itself, and qpax, compiled for a shape and spread over the devices of this process."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+import jaxgrasp as jg
+from benchmarks.suite.problems import FRICTION, MAX_FORCE, Grasps, Programs, sample
+
+# Wider vectors than XLA's default on CPUs; an internal option, so it is left out where XLA does not know it.
+OPTIONS = {"xla_cpu_prefer_vector_width": 512}
+
+
+class Compiled:
+    """A function compiled for its arguments; `run` calls it and waits, `out` is what it returned last."""
+
+    def __init__(self, function: Callable, batched: Any, shared: Any, devices: int) -> None:
+        mesh = Mesh(np.array(jax.local_devices()[:devices]), ("lanes",))
+        if devices > 1:
+            function = jax.shard_map(
+                function, mesh=mesh, in_specs=(P("lanes"), P()), out_specs=P("lanes"), check_vma=False
+            )
+        self._arguments = (
+            jax.device_put(batched, NamedSharding(mesh, P("lanes"))),
+            jax.device_put(shared, NamedSharding(mesh, P())),
+        )
+        start = time.perf_counter()
+        self._call = _compile(function, self._arguments)
+        self.compile_seconds = time.perf_counter() - start
+        self.out: Any = None
+        self.run()
+
+    def run(self) -> None:
+        self.out = jax.block_until_ready(self._call(*self._arguments))
+
+
+def _compile(function: Callable, arguments: tuple) -> Callable:
+    if jax.default_backend() == "cpu":
+        try:
+            return jax.jit(function, compiler_options=OPTIONS).lower(*arguments).compile()
+        except jax.errors.JaxRuntimeError as error:
+            print(f"  without the compiler's option for wide vectors: {str(error).splitlines()[0]}", flush=True)
+    return jax.jit(function).lower(*arguments).compile()
+
+
+def contacts(grasps: Grasps, dtype: str) -> jg.Contacts:
+    return jg.Contacts.from_frames(
+        grasps.positions.astype(dtype), grasps.frames.astype(dtype), friction=FRICTION, max_force=MAX_FORCE
+    )
+
+
+@functools.cache
+def margins(n_c: int, batch: int, dtype: str, devices: int, *, mapped: bool = False) -> Compiled:
+    """(21) from contacts to the whole solution, its certificates included; `mapped` by vmap over single grasps."""
+    grasps = sample(batch, n_c)
+    solve = jax.vmap(jg.largest_disturbance, (0, None)) if mapped else jg.largest_disturbance
+    return Compiled(solve, contacts(grasps, dtype), jg.DisturbanceSet.forces(1.0), devices)
+
+
+def worst_cases(grasps: Grasps, wrenches: np.ndarray, dtype: str, devices: int) -> Compiled:
+    """S_1 (17) and S_2 (18) for vertices that all grasps share."""
+    vertices = jg.DisturbanceSet.vertices(wrenches.astype(dtype))
+    return Compiled(jg.worst_case, contacts(grasps, dtype), vertices, devices)
+
+
+# qpax's explicit method never ends below about 1e-6 on these programs, and not at all in float32: its implicit one
+# does there.
+QPAX = {"float64": ("e", 1e-6), "float32": ("i", 1e-5)}
+
+
+def qpax(batch: Programs, dtype: str, devices: int) -> Compiled:
+    """x[-1] of every program, nan where qpax says that it did not converge; vmap as its authors show."""
+    import qpax
+
+    backend, tolerance = QPAX[dtype]
+    n = len(batch.cost)
+    cost, h = jnp.asarray(batch.cost, dtype), jnp.asarray(batch.h, dtype)
+
+    def solve(matrices: tuple[jax.Array, jax.Array], _: Any) -> jax.Array:
+        def one(A: jax.Array, B: jax.Array) -> jax.Array:
+            x, _, _, _, converged, _ = qpax.solve_qp(
+                jnp.zeros((n, n), dtype), cost, B, jnp.zeros(6, dtype), A, h, backend=backend, solver_tol=tolerance
+            )
+            return jnp.where(converged == 1, x[-1], jnp.nan)
+
+        return jax.vmap(one)(*matrices)
+
+    return Compiled(solve, (batch.A.astype(dtype), batch.B.astype(dtype)), (), devices)

@@ -1,0 +1,83 @@
+"""Peers in worker processes, one a core, each with its own share of the programs and its own warm workspaces."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+from benchmarks.suite import peers
+from benchmarks.suite.problems import Programs
+
+# The programs are small: without this every solver's threads would fight over the cores.
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+
+
+class Workers:
+    """A context with as many processes as cores; they wait without using the processor."""
+
+    def __init__(self, processes: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        before = dict(os.environ)
+        os.environ.update(ONE_THREAD)
+        self._pipes, self._processes = [], []
+        for _ in range(processes):
+            here, there = context.Pipe()
+            process = context.Process(target=_work, args=(there,), daemon=True)
+            process.start()
+            there.close()
+            self._pipes.append(here)
+            self._processes.append(process)
+        os.environ.clear()
+        os.environ.update(before)
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for pipe, process in zip(self._pipes, self._processes, strict=True):
+            pipe.close()
+            process.join()
+
+    def load(self, peer: str, batch: Programs) -> Loaded:
+        """Spread programs over the processes, or give all to one where the peer has threads of its own."""
+        pipes = self._pipes[: 1 if peer in peers.THREADED else None]
+        for pipe, rows in zip(pipes, np.array_split(np.arange(len(batch)), len(pipes)), strict=True):
+            pipe.send((peer, batch[rows]))
+        return Loaded(pipes, len(batch))
+
+
+class Loaded:
+    """A peer with its programs; valid until another `load` of the same peer."""
+
+    def __init__(self, pipes: list[Connection], count: int) -> None:
+        self._pipes, self.count = pipes, count
+        self._keys = [pipe.recv() for pipe in pipes]
+        self.answers = np.full(count, np.nan)
+
+    def run(self) -> float:
+        """Solve everything once; seconds of processor time that the workers took together."""
+        for pipe, key in zip(self._pipes, self._keys, strict=True):
+            pipe.send((key, None))
+        replies = [pipe.recv() for pipe in self._pipes]
+        self.answers = np.concatenate([answers for answers, _ in replies])
+        return sum(cpu for _, cpu in replies)
+
+
+def _work(pipe: Connection) -> None:
+    loaded = {}
+    while True:
+        try:
+            peer, batch = pipe.recv()
+        except EOFError:
+            return
+        if batch is not None:
+            loaded[peer] = getattr(peers, peer)(batch)
+            pipe.send(peer)
+            continue
+        start = time.process_time()
+        answers = loaded[peer]()
+        pipe.send((answers, time.process_time() - start))
