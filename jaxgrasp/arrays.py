@@ -1,6 +1,7 @@
 """Shape vocabulary, gradient-safe elementary functions, and frames from normals.
 
-Shapes are written batch first: `*batch` is any number of leading axes. Inside kernels the batch is one trailing axis, "lanes".
+Shapes are written batch first: `*batch` is any number of leading axes. Inside kernels the batch is one trailing axis,
+"lanes".
 """
 
 from collections.abc import Callable, Iterable
@@ -35,7 +36,10 @@ def as_float(name: str, value: ArrayLike, event: tuple[int | str, ...]) -> jax.A
 
 
 def literal(values: np.ndarray, dtype: jnp.dtype) -> jax.Array:
-    """A small constant array spelt out in the program; JAX would hand a NumPy array to the compiled program as one more argument."""
+    """A small constant array spelt out in the program.
+
+    JAX would hand a NumPy array to the compiled program as one more argument.
+    """
     if values.ndim == 0:
         return jnp.full((), float(values), dtype)
     return jnp.stack([literal(v, dtype) for v in values])
@@ -73,8 +77,8 @@ def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
 def frames_from_normals(normals: jax.Array) -> jax.Array:
     """Contact frames (t1, t2, n) of unit normals: the x and y axes turned by the smallest rotation that takes z to n.
 
-    The rule is smooth but at n = -z, where it is the half turn about y. Margins of coarse friction pyramids depend on the
-    tangents, so give frames of your own where these matter.
+    The rule is smooth but at n = -z, where it is the half turn about y. Margins of coarse friction pyramids depend on
+    the tangents, so give frames of your own where these matter.
 
     Args:
         normals: (*batch, 3), any positive length.

@@ -1,8 +1,8 @@
 """Keeping XLA's CPU backend from computing the same thing many times.
 
-XLA's CPU fusion copies a cheap producer into every consumer. In a long chain of small dense algebra that multiplies the work (and
-the compile time) tenfold, and `lax.optimization_barrier` is gone before fusion runs. A call that is marked as not inlineable is
-kept as a function of its own, so its results are computed once.
+XLA's CPU fusion copies a cheap producer into every consumer. In a long chain of small dense algebra that multiplies
+the work (and the compile time) tenfold, and `lax.optimization_barrier` is gone before fusion runs. A call that is
+marked as not inlineable is kept as a function of its own, so its results are computed once.
 """
 
 import contextlib
@@ -46,12 +46,18 @@ def fenced(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
-    """`step(i, state)` for i = 0 .. count - 1: a loop where fences are on, where code size is compile time; else spelt out, for fusion."""
+    """`step(i, state)` for i = 0 .. count - 1.
+
+    A loop where fences are on, since code size is compile time there; else spelt out, for fusion.
+    """
     if count == 1:
         return step(jnp.zeros((), jnp.int32), state)
     return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() else True)
 
 
 def each(function: Callable[[T], U], parts: T) -> U:
-    """`function` of every entry along the leading axis, stacked: one after the other where fences are on, else at once."""
+    """`function` of every entry along the leading axis, stacked.
+
+    One after the other where fences are on, else all at once.
+    """
     return jax.lax.map(function, parts) if _fences.get() else jax.vmap(function)(parts)

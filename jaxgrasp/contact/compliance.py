@@ -1,7 +1,8 @@
 """Compliance Q (14) and the weighted pseudo-inverse of the grasp map (15).
 
 Rank is decided here. The six rows of G, moments divided by the root-mean-square distance of the contacts, are
-orthonormalised; a row that is a combination of the earlier ones to within `RANK_TOLERANCE` of the longest row adds nothing and is dropped.
+orthonormalised. A row that is a combination of the earlier ones to within `RANK_TOLERANCE` of the longest row adds
+nothing and is dropped.
 """
 
 from dataclasses import dataclass
@@ -27,9 +28,14 @@ class Compliance:
 
     @classmethod
     def per_direction(cls, matrices: ArrayLike) -> "Compliance":
-        """Compliances (*batch, n_d, n_c, 3, 3), blocks by contact, or (*batch, n_d, 3 n_c, 3 n_c), full; contact frames, m/N.
+        """Compliances, one for each disturbance vertex.
 
-        They go with `DisturbanceSet.vertices` alone, in the order of its wrenches: a support function needs one pseudo-inverse.
+        They go with `DisturbanceSet.vertices` alone, in the order of its wrenches: a support function needs one
+        pseudo-inverse.
+
+        Args:
+            matrices: (*batch, n_d, n_c, 3, 3), blocks by contact, or (*batch, n_d, 3 n_c, 3 n_c), full; contact
+                frames, m/N.
 
         Raises:
             ValueError: fewer than three axes.
@@ -59,8 +65,8 @@ class Basis(NamedTuple):
 def row_basis(rows: jax.Array) -> Basis:
     """Modified Gram-Schmidt of rows (r, k, n, *lanes).
 
-    Rows that end up shorter than the tolerance become zero, and their operations stay unscaled. One step of Newton and Schulz then makes
-    the basis orthonormal to rounding: it squares what close rows lost.
+    Rows that end up shorter than the tolerance become zero, and their operations stay unscaled. One step of Newton and
+    Schulz then makes the basis orthonormal to rounding: it squares what close rows lost.
     """
     count, lanes = rows.shape[0], rows.shape[3:]
     index = jnp.arange(count).reshape(count, *[1] * len(lanes))
@@ -113,7 +119,8 @@ def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array
         contacts: n.
 
     Returns:
-        blocks (n, 3, 3, *lanes) or full (3 n, 3 n, *lanes), the identity where Q is not sound, None for Q = I; and bool (*lanes).
+        blocks (n, 3, 3, *lanes) or full (3 n, 3 n, *lanes), the identity where Q is not sound, None for Q = I; and
+        bool (*lanes).
     """
     if compliance is None:
         return None, jnp.array(True)

@@ -15,7 +15,8 @@ from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals
 class Contacts:
     """A batch of grasps by their hard-finger contacts, in the object frame about the centre of mass.
 
-    Every leaf has the full batch shape, so that ``jax.vmap(f)(contacts)`` works. Make one with `from_normals` or `from_frames`.
+    Every leaf has the full batch shape, so that ``jax.vmap(f)(contacts)`` works. Make one with `from_normals` or
+    `from_frames`.
     """
 
     positions: Float[Array, "*batch contacts 3"]
@@ -49,8 +50,8 @@ class Contacts:
             active: bool (*batch, n_c); None means that every contact is there.
 
         Raises:
-            ValueError: shapes that do not fit. Data that are not admissible are not errors here: the grasp that has them is
-                answered with `Status.INVALID_INPUT`.
+            ValueError: shapes that do not fit. Data that are not admissible are not errors here: the grasp that has
+                them is answered with `Status.INVALID_INPUT`.
         """
         positions = as_float("positions", positions, ("n_c", 3))
         frames = as_float("frames", frames, ("n_c", 3, 3))
@@ -62,7 +63,8 @@ class Contacts:
         n_c = positions.shape[-2]
         if n_c == 0 or frames.shape[-3] != n_c:
             raise ValueError(
-                f"frames: got shape {frames.shape}, wanted (*batch, n_c, 3, 3) with the n_c >= 1 of positions {positions.shape}"
+                f"frames: got shape {frames.shape}, wanted (*batch, n_c, 3, 3) "
+                f"with the n_c >= 1 of positions {positions.shape}"
             )
         for name, value in (("friction", friction), ("max_force", max_force), ("active", present)):
             if value.ndim and value.shape[-1] != n_c:
@@ -99,8 +101,8 @@ class Contacts:
 
         Args:
             positions: (*batch, n_c, 3), m, object frame, about the centre of mass.
-            outward_normals: (*batch, n_c, 3), pointing out of the object; they are normalised, and a zero normal makes its
-                grasp `Status.INVALID_INPUT`.
+            outward_normals: (*batch, n_c, 3), pointing out of the object; they are normalised, and a zero normal makes
+                its grasp `Status.INVALID_INPUT`.
             friction: scalar or (*batch, n_c), >= 0.
             max_force: scalar or (*batch, n_c), N, finite and positive.
             active: bool (*batch, n_c); None means that every contact is there.
@@ -112,7 +114,8 @@ class Contacts:
         n_c = as_float("positions", positions, ("n_c", 3)).shape[-2]
         if normals.shape[-2] != n_c:
             raise ValueError(
-                f"outward_normals: got shape {normals.shape}, wanted (*batch, {n_c}, 3) like positions {jnp.shape(positions)}"
+                f"outward_normals: got shape {normals.shape}, wanted (*batch, {n_c}, 3) "
+                f"like positions {jnp.shape(positions)}"
             )
         return cls.from_frames(
             positions, frames_from_normals(normals), friction=friction, max_force=max_force, active=active

@@ -6,11 +6,12 @@ import numpy as np
 
 
 def pyramid_facets(cone_edges: int) -> np.ndarray:
-    """Facet rows of the friction pyramid for unit friction: row k is (cos, sin, cos(pi / n_e)) at the angle pi (2 k + 1) / n_e.
+    """Facet rows of the friction pyramid for unit friction.
 
-    The edges stand at angles 2 pi k / n_e from t1, on Coulomb's cone |f_t| <= -mu f_n, so facet k has its normal halfway between two of
-    them. For friction mu the rows of C in C f <= -d (1) are these with the last entry times mu: the pyramid is inscribed, and what
-    holds for it holds for the cone.
+    Row k is (cos, sin, cos(pi / n_e)) at the angle pi (2 k + 1) / n_e. The edges stand at angles 2 pi k / n_e from t1,
+    on Coulomb's cone |f_t| <= -mu f_n, so facet k has its normal halfway between two of them. For friction mu the rows
+    of C in C f <= -d (1) are these with the last entry times mu. The pyramid is inscribed: what holds for it holds for
+    the cone.
 
     Args:
         cone_edges: n_e, at least 3.

@@ -46,10 +46,10 @@ def required_wrench(
     twist: ArrayLike | None = None,
     acceleration: ArrayLike | None = None,
 ) -> Float[Array, "*batch 6"]:
-    """The right-hand side b of the equation of motion (2): M (dV/dt - g) + N V, the wrench that the fingers must supply.
+    """The wrench that the fingers must supply: b = M (dV/dt - g) + N V, from the equation of motion (2).
 
-    With the twist V = (v, w) of the centre of mass in the object frame, N V = (m w x v, w x I w) (3). Known external wrenches are subtracted from
-    the result by the caller.
+    With the twist V = (v, w) of the centre of mass in the object frame, N V = (m w x v, w x I w) (3). Known external
+    wrenches are subtracted from the result by the caller.
 
     Args:
         mass: (*batch,), kg.

@@ -14,10 +14,11 @@ from jaxgrasp.disturbance.terms import Ball, Box, Ellipsoid, Term, Vertices
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class DisturbanceSet:
-    """A convex set D of wrenches (force N, moment N m; object frame, about the centre of mass) that contains the origin.
+    """A convex set D of wrenches that contains the origin; force N, moment N m, object frame, about the centre of mass.
 
-    The robustness margin is the largest factor by which D may be scaled while the grasp holds. Sets add up (Minkowski sum): ``a + b``
-    is every wrench of a with every wrench of b. A set without batch axes is shared by all grasps and costs no memory.
+    The robustness margin is the largest factor by which D may be scaled while the grasp holds. Sets add up (Minkowski
+    sum): ``a + b`` is every wrench of a with every wrench of b. A set without batch axes is shared by all grasps and
+    costs no memory.
     """
 
     terms: tuple[Term, ...]

@@ -1,7 +1,7 @@
 """The sets that disturbance sets are sums of: each knows its support function.
 
-Inside kernels the lanes trail: directions are (6, rows..., *lanes), the leaves of a term (event..., *lanes) with lanes of size 1
-where shared.
+Inside kernels the lanes trail: directions are (6, rows..., *lanes), the leaves of a term (event..., *lanes) with lanes
+of size 1 where shared.
 """
 
 import math
@@ -38,7 +38,10 @@ class Term(Protocol):
         ...
 
     def extent(self) -> jax.Array:
-        """(*batch, 6), for batch-first leaves: the largest |w_i| for every component; negative or NaN where the data are not a set."""
+        """The largest |w_i| for every component, (*batch, 6), for batch-first leaves.
+
+        Negative or NaN where the data are not a set.
+        """
         ...
 
 
@@ -53,8 +56,8 @@ def _combine(weights: jax.Array, directions: jax.Array) -> jax.Array:
 def _chunk(row: jax.Array, lanes: tuple[int, ...]) -> int:
     """How many vertices to work on at a time.
 
-    Many, so that directions are read seldom; but XLA's CPU backend cuts an operation in parallel tasks, which cannot be done inside a tile,
-    where it counts more than one flop a byte and 2e5 of flops + 10 bytes.
+    Many, so that directions are read seldom. But XLA's CPU backend cuts an operation in parallel tasks, which cannot be
+    done inside a tile, where it counts more than one flop a byte and 2e5 of flops + 10 bytes.
     """
     size, width = row.size, row.dtype.itemsize
     for chunk in (16, 8, 4, 2):

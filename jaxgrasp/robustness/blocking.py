@@ -14,9 +14,10 @@ from jaxgrasp.robustness.grasps import Grasps, over_grasps
 def blocking_forces(
     contacts: Contacts, wrenches: ArrayLike, compliance: ArrayLike | Compliance | None = None
 ) -> Float[Array, "*batch directions contacts 3"]:
-    """Blocking forces delta f_j = -G*_j W_j (15): of all contact forces that balance W_j, those with the least delta f' Q delta f.
+    """Blocking forces delta f_j = -G*_j W_j (15): what the fingers add while disturbance j acts.
 
-    They are for lambda = 1 and add to the tightening forces f_0 while disturbance j acts. On a rank-deficient grasp they balance what lies in the range of G.
+    Of all contact forces that balance W_j they have the least delta f' Q delta f. They are for lambda = 1 and add to
+    the tightening forces f_0. On a rank-deficient grasp they balance what lies in the range of G.
 
     Args:
         contacts: the grasps.

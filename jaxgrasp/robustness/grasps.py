@@ -172,16 +172,16 @@ def _compliance(value: Any, n: int) -> tuple[jax.Array, tuple[int, ...]]:
 def _per_vertex(compliance: Compliance, disturbances: DisturbanceSet, n: int) -> tuple[jax.Array, tuple[int, ...]]:
     if len(disturbances.terms) != 1 or not isinstance(disturbances.terms[0], Vertices):
         raise ValueError(
-            "compliance: got one Q for each direction, wanted a single Q, since the disturbance set is not given by vertices; "
-            "use DisturbanceSet.vertices"
+            "compliance: got one Q for each direction, wanted a single Q, "
+            "since the disturbance set is not given by vertices; use DisturbanceSet.vertices"
         )
     array, count = compliance.per_vertex, disturbances.terms[0].wrenches.shape[-2]
     for event in ((count, n, 3, 3), (count, 3 * n, 3 * n)):
         if array.shape[-len(event) :] == event:
             return array, array.shape[: array.ndim - len(event)]
     raise ValueError(
-        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or (*batch, {count}, {3 * n}, {3 * n}), "
-        f"one Q for each of the {count} wrenches"
+        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or "
+        f"(*batch, {count}, {3 * n}, {3 * n}), one Q for each of the {count} wrenches"
     )
 
 

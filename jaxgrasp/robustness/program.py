@@ -1,8 +1,9 @@
 """The scaled form of (21) and (22) that the solver sees.
 
-Per contact with F = f_max: tangential forces in units of mu F, normal forces in units of F, so that all facet rows become the same constants and
-forces are of order one. sigma = -Lambda S_1 / (mu F) and Lambda S_2 / F, with Lambda such that the largest is 1: lambda = Lambda * lambda_hat. The six rows
-of G are orthonormalised, and rows that add nothing are dropped.
+Per contact with F = f_max: tangential forces in units of mu F, normal forces in units of F, so that all facet rows
+become the same constants and forces are of order one. sigma = -Lambda S_1 / (mu F) and Lambda S_2 / F, with Lambda such
+that the largest is 1: lambda = Lambda * lambda_hat. The six rows of G are orthonormalised, and rows that add nothing are
+dropped.
 """
 
 import math
@@ -20,7 +21,7 @@ from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.worst_case import reaches_outside, worst_rows
 from jaxgrasp.solvers.block_kkt import Blocks
 
-# Friction below this is scaled like this: tangential forces then stay below it in units of f_max, which is as good as none.
+# Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
 _LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
 
 

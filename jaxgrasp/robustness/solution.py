@@ -15,8 +15,9 @@ class Solution:
     """Tightening forces of a batch of grasps, with what certifies them."""
 
     margin: Float[Array, "*batch"]
-    """lambda, certified from below: the factor by which the disturbance set may be scaled while `forces` hold the object. Negative where the
-    required wrench itself cannot be borne; NaN where there is no answer; inf where nothing disturbs."""
+    """lambda, certified from below: the factor by which the disturbance set may be scaled while `forces` hold the
+    object. Negative where the required wrench itself cannot be borne; NaN where there is no answer; inf where nothing
+    disturbs."""
     upper_bound: Float[Array, "*batch"]
     """No forces whatever reach a margin above this one."""
     forces: Float[Array, "*batch contacts 3"]
@@ -28,11 +29,13 @@ class Solution:
     iterations: Int[Array, "*batch"]
     """Interior-point steps taken; of both programs for (22)."""
     primal_residual: Float[Array, "*batch"]
-    """Largest violation of any row by `forces` at `margin` (at the margin asked for in (22)), in units of the mean f_max."""
+    """Largest violation of any row by `forces` at `margin` (at the margin asked for in (22)), in units of the mean
+    f_max."""
     dual_residual: Float[Array, "*batch"]
     """Largest entry of the stationarity condition in the scaled program."""
     gap: Float[Array, "*batch"]
-    """Certified gap: (upper_bound - margin) / max(Lambda, |margin|) for (21), with Lambda the margin's natural scale; that of the effort for (22)."""
+    """Certified gap: (upper_bound - margin) / max(Lambda, |margin|) for (21), with Lambda the margin's natural scale;
+    that of the effort for (22)."""
     rank: Int[Array, "*batch"]
     """Rank of the grasp map."""
     cone_multipliers: Float[Array, "*batch contacts edges"]

@@ -1,7 +1,8 @@
 """The worst that a disturbance set does to each row: S_1 (17) and S_2 (18), through support functions.
 
-While the disturbance w acts, the grasp answers with the blocking forces -G* w. So facet row k of contact i loses at most h_D(-(C G*)_ik)
-and the bound on its normal force at most h_D((E G*)_i): S_1 = -h_D(-(C G*)), S_2 = h_D(E G*), whatever kind of set D is.
+While the disturbance w acts, the grasp answers with the blocking forces -G* w. So facet row k of contact i loses at
+most h_D(-(C G*)_ik) and the bound on its normal force at most h_D((E G*)_i): S_1 = -h_D(-(C G*)), S_2 = h_D(E G*),
+whatever kind of set D is.
 """
 
 import jax
@@ -34,7 +35,8 @@ def worst_case(
         cone_edges: n_e.
 
     Returns:
-        S_1 <= 0 (*batch, n_c, n_e), N, and S_2 >= 0 (*batch, n_c), N; zero for absent contacts, NaN where the data are not admissible.
+        S_1 <= 0 (*batch, n_c, n_e), N, and S_2 >= 0 (*batch, n_c), N; zero for absent contacts, NaN where the data are
+        not admissible.
 
     Raises:
         ValueError: shapes or options that do not fit.

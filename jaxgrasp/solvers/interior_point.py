@@ -1,14 +1,14 @@
 """The one primal-dual interior-point loop: Mehrotra's predictor-corrector over a batch of lanes.
 
-A problem says what its unknowns are and how to solve its Newton system; the loop owns step lengths, centring, freezing of
-finished lanes and the stopping rule. All arrays carry the batch in their trailing axes ("lanes"), so that one lane is one
-problem and every elementwise operation works on a full vector of problems; with no trailing axis the same code is the
+A problem says what its unknowns are and how to solve its Newton system; the loop owns step lengths, centring, freezing
+of finished lanes and the stopping rule. All arrays carry the batch in their trailing axes ("lanes"), so that one lane is
+one problem and every elementwise operation works on a full vector of problems; with no trailing axis the same code is the
 program of a single problem.
 
 The problems have the form: minimise over x subject to E x = b and A x + s = h, s >= 0, with multipliers y and z >= 0.
 
-Source: Mehrotra (1992), "On the implementation of a primal-dual interior point method"; the step rule and the freezing are
-described in `solve`.
+Source: Mehrotra (1992), "On the implementation of a primal-dual interior point method"; the step rule and the freezing
+are described in `solve`.
 """
 
 from typing import Any, NamedTuple, Protocol
@@ -129,9 +129,9 @@ class _Carry(NamedTuple):
 def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
     """Run the loop until every active lane is finished.
 
-    Centring is (mu_aff / mu)^3; a step goes to max(0.99, 1 - max(mu, step_cap)) of the way to the boundary. A lane is finished
-    when its certified bounds have met, or when `patience` steps in a row cut their gap by less than a tenth; then it freezes:
-    nothing of it changes any more, whatever its neighbours do. A step that is not finite is not taken.
+    Centring is (mu_aff / mu)^3; a step goes to max(0.99, 1 - max(mu, step_cap)) of the way to the boundary. A lane is
+    finished when its certified bounds have met, or when `patience` steps in a row cut their gap by less than a tenth;
+    then it freezes: nothing of it changes any more, whatever its neighbours do. A step that is not finite is not taken.
 
     Args:
         problem: what to solve.

@@ -1,7 +1,7 @@
 """Batches as lanes: any leading axes and any nesting of vmap become one trailing axis, worked through in tiles.
 
-A kernel is a function of arrays whose last axis is the lane; a leaf that all lanes share has a last axis of size 1. On CPUs the lanes are cut into
-tiles that stay in the cache; elsewhere they go at once.
+A kernel is a function of arrays whose last axis is the lane; a leaf that all lanes share has a last axis of size 1. On
+CPUs the lanes are cut into tiles that stay in the cache; elsewhere they go at once.
 """
 
 import math
@@ -29,7 +29,8 @@ def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree, blo
     """Run a kernel over the leading axis of its arguments.
 
     Args:
-        kernel: takes the tree of arguments with the lane axis last (size 1 where shared), returns a tree of arrays with the lane axis last.
+        kernel: takes the tree of arguments with the lane axis last (size 1 where shared), returns a tree of arrays with
+            the lane axis last.
         arguments: leaves (lanes, ...), or without the leading axis where shared.
         shared: like arguments, bool: the leaf is the same for all lanes.
         compact: the kernel is free of library calls and large reductions, so that a tile can be one function on CPUs.
@@ -113,7 +114,7 @@ def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: i
             with fences(True):
                 if not compact:
                     return solve(parts)
-                # XLA's CPU backend then emits the tile as one function, free of the overhead it has for every operation.
+                # XLA's CPU backend then emits the tile as one function, free of the overhead for every operation.
                 with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
                     return tile(parts)[0]
 
