@@ -321,8 +321,8 @@ class MarginProblem(BlockProblem):
         parts = []
         for g, x_g in zip(self.groups, x, strict=True):
             info = jnp.finfo(g.h.dtype)
-            # A row that lambda hardly moves may miss its right-hand side by rounding.
-            soft = g.h + jnp.where(g.sigma <= 1e4 * info.eps, 8 * info.eps, 0)
+            # A row that lambda hardly moves may miss its right-hand side by a little more than rounding.
+            soft = g.h + jnp.where(g.sigma <= 1e4 * info.eps, max(8 * float(info.eps), 1e-11), 0)
             parts.append(_least((soft - _apply(g, x_g)) / jnp.maximum(g.sigma, 4 * info.tiny)))
         least = fold(jnp.minimum, parts)
         return jnp.where(least < -1e12, -jnp.inf, least)
