@@ -2,8 +2,8 @@
 
 Per contact with F = f_max: tangential forces in units of mu F, normal forces in units of F, so that all facet rows
 become the same constants and forces are of order one. sigma = -Lambda S_1 / (mu F) and Lambda S_2 / F, with Lambda such
-that the largest is 1: lambda = Lambda * lambda_hat. The six rows of G are orthonormalised, and rows that add nothing are
-dropped.
+that the largest is 1: lambda = Lambda * lambda_hat. The six rows of G are orthonormalised, and rows that add nothing
+are dropped.
 """
 
 import math

@@ -1,9 +1,9 @@
 """The one primal-dual interior-point loop: Mehrotra's predictor-corrector over a batch of lanes.
 
 A problem says what its unknowns are and how to solve its Newton system; the loop owns step lengths, centring, freezing
-of finished lanes and the stopping rule. All arrays carry the batch in their trailing axes ("lanes"), so that one lane is
-one problem and every elementwise operation works on a full vector of problems; with no trailing axis the same code is the
-program of a single problem.
+of finished lanes and the stopping rule. All arrays carry the batch in their trailing axes ("lanes"), so that one lane
+is one problem and every elementwise operation works on a full vector of problems; with no trailing axis the same code
+is the program of a single problem.
 
 The problems have the form: minimise over x subject to E x = b and A x + s = h, s >= 0, with multipliers y and z >= 0.
 
