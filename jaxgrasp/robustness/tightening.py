@@ -45,19 +45,19 @@ def largest_disturbance(
     cone_edges: int = 8,
     cone_margin: ArrayLike = 0.0,
 ) -> Solution:
-    """The robustness margin: the largest factor lambda by which a set of disturbances may be scaled while the grasp holds, program (21).
+    """The robustness margin (21): the largest factor by which a set of disturbances may be scaled while the grasp holds.
 
     max lambda over (f_0, lambda) subject to G f_0 = b, C f_0 - S_1 lambda <= -d, -E f_0 + S_2 lambda <= f_max.
 
-    lambda is left free: where even b cannot be borne the status is INFEASIBLE and a negative margin is the proof. A grasp without force
-    closure and without load has margin 0.
+    lambda is left free: where even b cannot be borne the status is INFEASIBLE and a negative margin is the proof. A
+    grasp without force closure and without load has margin 0.
 
     Args:
         contacts: the grasps; their dtype is the precision.
         disturbances: the set D; without batch axes it is shared by all grasps.
         required_wrench: b (*batch, 6), N and N m, see `required_wrench`; None is zero.
-        compliance: Q of (14), contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3), full (*batch, 3 n_c, 3 n_c), or
-            `Compliance.per_direction`; None is the identity.
+        compliance: Q of (14), contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3), full
+            (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity.
         cone_edges: n_e, edges of the friction pyramid, which is inscribed in Coulomb's cone.
         cone_margin: d (*batch,), N, >= 0: what every facet row keeps in reserve.
 
@@ -68,8 +68,8 @@ def largest_disturbance(
         ValueError: shapes or options that do not fit; at trace time.
 
     Status:
-        SOLVED; INFEASIBLE (b cannot be borne); UNBOUNDED (nothing disturbs, margin inf); INVALID_INPUT (data not admissible, for that
-        grasp alone); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot tell).
+        SOLVED; INFEASIBLE (b cannot be borne); UNBOUNDED (nothing disturbs, margin inf); INVALID_INPUT (data not
+        admissible, for that grasp alone); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot tell).
     """
     pyramid_facets(cone_edges)
     return over_grasps(
@@ -95,8 +95,8 @@ def least_effort(
 ) -> Solution:
     """The tightening forces of least effort that give a chosen margin, program (22).
 
-    min 1/2 f_0' Q_0 f_0 subject to the rows of (21) with lambda = margin. Solves (21) first, for a start and for the certificate where the margin
-    cannot be had.
+    min 1/2 f_0' Q_0 f_0 subject to the rows of (21) with lambda = margin. Solves (21) first, for a start and for the
+    certificate where the margin cannot be had.
 
     Args:
         contacts: the grasps; their dtype is the precision.
@@ -104,18 +104,21 @@ def least_effort(
         margin: lambda (*batch,), >= 0; usually a share, say 75 %, of (21)'s.
         required_wrench: b (*batch, 6), N and N m; None is zero.
         compliance: Q, as in `largest_disturbance`.
-        effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the identity.
+        effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the
+            identity.
         cone_edges: n_e.
         cone_margin: d (*batch,), N, >= 0.
 
     Returns:
-        Solution; `margin` is what `forces` certify, at least the one asked for up to rounding, `upper_bound` that of (21).
+        Solution; `margin` is what `forces` certify, at least the one asked for up to rounding, `upper_bound` that of
+        (21).
 
     Raises:
         ValueError: shapes or options that do not fit; at trace time.
 
     Status:
-        As in `largest_disturbance`; INFEASIBLE where the margin is above what (21) allows; INVALID_INPUT where it is negative or NaN.
+        As in `largest_disturbance`; INFEASIBLE where the margin is above what (21) allows; INVALID_INPUT where it is
+        negative or NaN.
     """
     pyramid_facets(cone_edges)
     return over_grasps(

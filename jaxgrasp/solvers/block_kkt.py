@@ -1,16 +1,16 @@
-"""Programs whose unknowns come in small blocks with constant row patterns, tied by a few equalities and one border column.
+"""Programs of small blocks with constant row patterns, tied by a few equalities and one border column.
 
 With blocks x_i (three forces of a contact, or one bounded actuator effort), a scalar lambda and rows
 
     A x_i + sigma_i lambda <= h_i      for every block i,
     sum_i E_i x_i = b                  (a static number of equality rows),
 
-`MarginProblem` maximises lambda, `EffortProblem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the same for every block of a
-group, so they are never stored. The Newton system is reduced block by block (k x k), then lambda, then the
-equality rows: the cost is linear in the number of blocks.
+`MarginProblem` maximises lambda, `EffortProblem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the same
+for every block of a group, so they are never stored. The Newton system is reduced block by block (k x k), then lambda,
+then the equality rows: the cost is linear in the number of blocks.
 
-Both certify their answers at every step: any x with E x = b attains lambda_lo = min (h - A x) / sigma; any z >= 0 scaled to sum sigma z = 1 proves
-lambda* <= h'z + b'y + radius |A'z + E'y|_1, where radius bounds |x|_inf at the optimum.
+Both certify their answers at every step: any x with E x = b attains lambda_lo = min (h - A x) / sigma; any z >= 0 scaled
+to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1, where radius bounds |x|_inf at the optimum.
 
 Callers scale: |x| about 1 at most, sigma <= 1, the rows of E orthonormal or zero.
 """
@@ -233,7 +233,10 @@ class BlockProblem:
         return _Factors(blocks, _inverse_root(complete(matrix, v, border)), weights, border, v)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
-        """Orthogonalise sqrt(W) [A, sigma] column by column: A'WA itself would square its condition, too much for float32."""
+        """Orthogonalise sqrt(W) [A, sigma] column by column.
+
+        A'WA itself would square its condition, too much for float32.
+        """
         k = g.patterns.shape[1]
         root = jnp.sqrt(weights)
         columns = [root * _spread(g.patterns[:, a], root) for a in range(k)]
@@ -314,10 +317,16 @@ class BlockProblem:
 
 @dataclass(frozen=True)
 class MarginProblem(BlockProblem):
-    """max lambda; x is (blocks, lambda). Record: `lower` is attained by `x`, `upper` is certified by (y, z), sum sigma z = 1."""
+    """max lambda; x is (blocks, lambda).
+
+    Record: `lower` is attained by `x`, `upper` is certified by (y, z) with sum sigma z = 1.
+    """
 
     def attained(self, x: Rows) -> jax.Array:
-        """Min (h - A x) / sigma, the lambda that x attains when E x = b; -inf where a row with sigma = 0 is violated."""
+        """Min (h - A x) / sigma, the lambda that x attains when E x = b.
+
+        It is -inf where a row with sigma = 0 is violated.
+        """
         parts = []
         for g, x_g in zip(self.groups, x, strict=True):
             info = jnp.finfo(g.h.dtype)
@@ -328,7 +337,7 @@ class MarginProblem(BlockProblem):
         return jnp.where(least < -1e12, -jnp.inf, least)
 
     def start(self) -> Iterate:
-        """Closed form: light forces that meet E x = b, a lambda well below what they attain, multipliers with A'z = 0."""
+        """In closed form: light forces that meet E x = b, lambda well below what they attain, multipliers with A'z = 0."""
         blocks = self.project(
             tuple(
                 jnp.broadcast_to(_spread(g.start, g.columns[0]), g.columns.shape[1:]) * g.present for g in self.groups
@@ -415,7 +424,10 @@ class MarginProblem(BlockProblem):
         return Record(-inf, inf, x, *self.first_multipliers())
 
     def gap_scale(self, record: Record) -> jax.Array:
-        """Gaps count relative to max(1, |lambda|); where no x attains anything, a negative upper bound says all there is to know."""
+        """Gaps count relative to max(1, |lambda|).
+
+        Where no x attains anything, a negative upper bound says all there is to know.
+        """
         hopeless = jnp.isinf(record.lower) & (record.upper < -1e-6)
         return jnp.where(
             hopeless, jnp.inf, jnp.maximum(1, jnp.where(jnp.isinf(record.lower), 1, jnp.abs(record.lower)))
@@ -430,7 +442,7 @@ class MarginProblem(BlockProblem):
         value = fold(jnp.add, [_total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
         value = value + fold(jnp.add, iterate.y * self.rhs)
         best = jnp.maximum(lower, record.lower)
-        # Where nothing is attained yet, the bound holds for lambda >= 0; a negative one then excludes these, which is all it says.
+        # Where nothing is attained yet, the bound holds for lambda >= 0; a negative one excludes these and says no more.
         radius = 1 + self.radius * jnp.where(jnp.isinf(best), 0, jnp.maximum(0, -best))
         scale = 1 / pull
         upper = jnp.where(pull > 0, (value + radius * lost) * scale, jnp.inf)
@@ -446,7 +458,9 @@ class MarginProblem(BlockProblem):
 
 @dataclass(frozen=True)
 class EffortProblem(BlockProblem):
-    """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at. Record: `upper` is attained by `x`, `lower` is certified by (y, z).
+    """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at.
+
+    Record: `upper` is attained by `x`, `lower` is certified by (y, z).
 
     H is scaled so that its entries are 1 at most. Without lambda the blocks' bounds are |x|_inf <= 1.
 
@@ -509,14 +523,16 @@ class EffortProblem(BlockProblem):
         return jnp.maximum(jnp.where(jnp.isinf(record.upper), 0, record.upper), 1e-3)
 
     def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
-        """Both bounds; what a point misses the rows by is charged at the rows' multipliers, so that no effort is saved by it."""
+        """Both bounds.
+
+        What a point misses the rows by is charged at the rows' multipliers, so that no effort is saved by it.
+        """
         x = fenced(self.project)(iterate.x)
-        value = lambda x: (
-            0.5
-            * fold(  # noqa: E731
-                jnp.add, [_total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
-            )
-        )
+
+        def value(x: Rows) -> jax.Array:
+            terms = [_total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
+            return 0.5 * fold(jnp.add, terms)
+
         over = [jnp.maximum(_apply(g, x_g) - g.h, 0) for g, x_g in zip(self.groups, x, strict=True)]
         missed = fold(jnp.maximum, [-_least(-o) for o in over])
         charge = fold(jnp.add, [_total(o * z) for o, z in zip(over, iterate.z, strict=True)])
