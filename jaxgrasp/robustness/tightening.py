@@ -45,7 +45,7 @@ def largest_disturbance(
     cone_edges: int = 8,
     cone_margin: ArrayLike = 0.0,
 ) -> Solution:
-    """The robustness margin (21): the largest factor by which a set of disturbances may be scaled while the grasp holds.
+    """The robustness margin (21): the largest factor by which the disturbances may be scaled while the grasp holds.
 
     max lambda over (f_0, lambda) subject to G f_0 = b, C f_0 - S_1 lambda <= -d, -E f_0 + S_2 lambda <= f_max.
 

@@ -5,12 +5,12 @@ With blocks x_i (three forces of a contact, or one bounded actuator effort), a s
     A x_i + sigma_i lambda <= h_i      for every block i,
     sum_i E_i x_i = b                  (a static number of equality rows),
 
-`MarginProblem` maximises lambda, `EffortProblem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the same
-for every block of a group, so they are never stored. The Newton system is reduced block by block (k x k), then lambda,
-then the equality rows: the cost is linear in the number of blocks.
+`MarginProblem` maximises lambda, `EffortProblem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the
+same for every block of a group, so they are never stored. The Newton system is reduced block by block (k x k), then
+lambda, then the equality rows: the cost is linear in the number of blocks.
 
-Both certify their answers at every step: any x with E x = b attains lambda_lo = min (h - A x) / sigma; any z >= 0 scaled
-to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1, where radius bounds |x|_inf at the optimum.
+Both certify their answers at every step. Any x with E x = b attains lambda_lo = min (h - A x) / sigma. Any z >= 0
+scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1, where radius bounds |x|_inf at the optimum.
 
 Callers scale: |x| about 1 at most, sigma <= 1, the rows of E orthonormal or zero.
 """
@@ -337,7 +337,7 @@ class MarginProblem(BlockProblem):
         return jnp.where(least < -1e12, -jnp.inf, least)
 
     def start(self) -> Iterate:
-        """In closed form: light forces that meet E x = b, lambda well below what they attain, multipliers with A'z = 0."""
+        """Light forces that meet E x = b, lambda well below what they attain, multipliers with A'z = 0."""
         blocks = self.project(
             tuple(
                 jnp.broadcast_to(_spread(g.start, g.columns[0]), g.columns.shape[1:]) * g.present for g in self.groups
@@ -442,7 +442,7 @@ class MarginProblem(BlockProblem):
         value = fold(jnp.add, [_total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
         value = value + fold(jnp.add, iterate.y * self.rhs)
         best = jnp.maximum(lower, record.lower)
-        # Where nothing is attained yet, the bound holds for lambda >= 0; a negative one excludes these and says no more.
+        # Where nothing is attained yet, the bound holds for lambda >= 0; a negative one excludes these, no more.
         radius = 1 + self.radius * jnp.where(jnp.isinf(best), 0, jnp.maximum(0, -best))
         scale = 1 / pull
         upper = jnp.where(pull > 0, (value + radius * lost) * scale, jnp.inf)

@@ -90,8 +90,8 @@ def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: i
         own = [jnp.pad(x, [(0, count * tile - lanes)] + [(0, 0)] * (x.ndim - 1)) for x in own]
 
         def body(parts: list[jax.Array]) -> Tree:
-            parts = iter(parts)
-            return one([x if s else next(parts) for x, s in zip(leaves, shared, strict=True)])
+            batched = iter(parts)
+            return one([x if s else next(batched) for x, s in zip(leaves, shared, strict=True)])
 
         if count == 1:
             out = jax.tree.map(lambda x: x[None], body(own))
