@@ -4,7 +4,7 @@ Shapes are written batch first: `*batch` is any number of leading axes. Inside k
 "lanes".
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 
-def as_float(name: str, value: ArrayLike, event: tuple[int | str, ...]) -> jax.Array:
+def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | str, ...]) -> jax.Array:
     """An array in JAX's floating precision whose trailing axes are `event`.
 
     Args:

@@ -1,5 +1,7 @@
 """The grasp map (5) and the wrench that the grasp must supply, (2)-(3)."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -41,7 +43,7 @@ def grasp_map(contacts: Contacts) -> Float[Array, "*batch 6 vars"]:
 
 def required_wrench(
     mass: ArrayLike,
-    gravity: ArrayLike = (0.0, 0.0, -9.81),
+    gravity: ArrayLike | Sequence[float] = (0.0, 0.0, -9.81),
     inertia: ArrayLike | None = None,
     twist: ArrayLike | None = None,
     acceleration: ArrayLike | None = None,

@@ -10,7 +10,7 @@ same for every block of a group, so they are never stored. The Newton system is 
 lambda, then the equality rows: the cost is linear in the number of blocks.
 
 Both certify their answers at every step. Any x with E x = b attains lambda_lo = min (h - A x) / sigma. Any z >= 0
-scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1, where radius bounds |x|_inf at the optimum.
+scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1; radius bounds |x|_inf at the optimum.
 
 Callers scale: |x| about 1 at most, sigma <= 1, the rows of E orthonormal or zero.
 """
