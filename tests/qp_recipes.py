@@ -164,8 +164,8 @@ RECIPES: dict[str, Callable[..., Program]] = {
     )
 }
 
-# (variables, equalities, inequalities); even numbers of inequalities, so that recipes that pair rows keep their number
-SIZES = ((4, 1, 8), (10, 2, 30), (20, 5, 60), (40, 10, 120), (60, 14, 236))
+# (variables, equalities, inequalities), with room for the rows of the recipes that pair them
+SIZES = ((4, 2, 8), (10, 2, 30), (20, 5, 60), (40, 10, 120), (60, 14, 236))
 
 
 def batch(recipe: str, size: tuple[int, int, int], count: int, seed: int = 0) -> list[Program]:
