@@ -61,8 +61,6 @@ def processes(*, everything: bool) -> list[dict]:
         jobs[f"jaxgrasp {dtype}, {small} programs"] = ("jit", dtype, small)
         if everything:
             jobs[f"jaxgrasp {dtype}, {LARGE_BATCH} programs"] = ("jit", dtype, str(LARGE_BATCH))
-        if find_spec("qpax") and everything:
-            jobs[f"qpax {dtype}, {small} programs"] = ("qpax", dtype, small)
     for peer, distribution in peers.PEERS.items():
         if find_spec(distribution) and everything and peer != "osqp":
             jobs[f"{peer}, {small} programs"] = ("peer", peer)
@@ -91,9 +89,6 @@ def _main(what: str, *words: str) -> None:
     from benchmarks.suite import ours
 
     grasps = problems.sample(count, 4)
-    if what == "qpax":
-        ours.qpax(problems.programs(grasps), dtype, 1)
-        return
     contacts, disturbances = ours.contacts(grasps, dtype), jg.DisturbanceSet.forces(1.0)
     if what == "jit":
         jax.block_until_ready(jax.jit(jg.largest_disturbance)(contacts, disturbances))

@@ -1,4 +1,4 @@
-"""The package itself, and qpax, compiled for a shape and spread over the devices of this process."""
+"""The package itself, compiled for a shape and spread over the devices of this process."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 import jaxgrasp as jg
-from benchmarks.suite.problems import FRICTION, MAX_FORCE, Grasps, Programs, sample
+from benchmarks.suite.problems import FRICTION, MAX_FORCE, Grasps, sample
 
 # Wider vectors than XLA's default on CPUs; an internal option, so it is left out where XLA does not know it.
 OPTIONS = {"xla_cpu_prefer_vector_width": 512}
@@ -70,28 +69,3 @@ def worst_cases(grasps: Grasps, wrenches: np.ndarray, dtype: str, devices: int) 
     """S_1 (17) and S_2 (18) for vertices that all grasps share."""
     vertices = jg.DisturbanceSet.vertices(wrenches.astype(dtype))
     return Compiled(jg.worst_case, contacts(grasps, dtype), vertices, devices)
-
-
-# qpax's explicit method never ends below about 1e-6 on these programs, and not at all in float32: its implicit one
-# does there.
-QPAX = {"float64": ("e", 1e-6), "float32": ("i", 1e-5)}
-
-
-def qpax(batch: Programs, dtype: str, devices: int) -> Compiled:
-    """x[-1] of every program, nan where qpax says that it did not converge; vmap as its authors show."""
-    import qpax
-
-    backend, tolerance = QPAX[dtype]
-    n = len(batch.cost)
-    cost, h = jnp.asarray(batch.cost, dtype), jnp.asarray(batch.h, dtype)
-
-    def solve(matrices: tuple[jax.Array, jax.Array], _: Any) -> jax.Array:
-        def one(A: jax.Array, B: jax.Array) -> jax.Array:
-            x, _, _, _, converged, _ = qpax.solve_qp(
-                jnp.zeros((n, n), dtype), cost, B, jnp.zeros(6, dtype), A, h, backend=backend, solver_tol=tolerance
-            )
-            return jnp.where(converged == 1, x[-1], jnp.nan)
-
-        return jax.vmap(one)(*matrices)
-
-    return Compiled(solve, (batch.A.astype(dtype), batch.B.astype(dtype)), (), devices)

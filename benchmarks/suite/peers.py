@@ -1,7 +1,8 @@
 """The solvers that one would use instead, each called the way its authors document for many programs of one shape.
 
 They get the scaled, orthonormalised programs ready made, in the memory layout that they want, so that only their own
-work is timed; ours has to make its programs from the contacts. No JAX in here: these run in worker processes.
+work is timed; ours has to make its programs from the contacts. These run in
+worker processes, where only qpax imports JAX.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ PEERS = {
     "proxqp": "proxsuite",
     "proxqp_parallel": "proxsuite",
     "osqp": "osqp",
+    "qpax_float64": "qpax",
+    "qpax_float32": "qpax",
 }
 """Each with the distribution that has it."""
 
@@ -194,6 +197,39 @@ def osqp(batch: Programs) -> Solve:
         return answers
 
     return solve
+
+
+def qpax_float64(batch: Programs) -> Solve:
+    return _qpax(batch, "float64", "e", TOLERANCE)
+
+
+def qpax_float32(batch: Programs) -> Solve:
+    # In float32 its explicit method ends on none of these programs, at any tolerance; its implicit one on all.
+    return _qpax(batch, "float32", "i", 1e-5)
+
+
+def _qpax(batch: Programs, dtype: str, backend: str, tolerance: float) -> Solve:
+    """By vmap, as its authors show.
+
+    In processes like the others: its implicit method never returns when run on two CPU devices of one process at once.
+    """
+    import jax
+    import jax.numpy as jnp
+    import qpax
+
+    jax.config.update("jax_enable_x64", True)
+    n = len(batch.cost)
+    cost, h = jnp.asarray(batch.cost, dtype), jnp.asarray(batch.h, dtype)
+
+    def one(A: jax.Array, B: jax.Array) -> jax.Array:
+        x, _, _, _, converged, _ = qpax.solve_qp(
+            jnp.zeros((n, n), dtype), cost, B, jnp.zeros(6, dtype), A, h, backend=backend, solver_tol=tolerance
+        )
+        return jnp.where(converged == 1, x[-1], jnp.nan)
+
+    matrices = jnp.asarray(batch.A, dtype), jnp.asarray(batch.B, dtype)
+    call = jax.jit(jax.vmap(one)).lower(*matrices).compile()
+    return lambda: np.asarray(call(*matrices), float)
 
 
 def _sparse(matrices: np.ndarray) -> tuple[np.ndarray, sp.csc_matrix]:

@@ -31,7 +31,8 @@ SUBSAMPLE = {
     "proxqp": 512,
     "proxqp_parallel": 512,
     "osqp": 32,
-    "qpax": 1024,
+    "qpax_float64": 1024,
+    "qpax_float32": 1024,
     "reference": 1024,
 }
 
@@ -104,21 +105,17 @@ def against_peers(sizes: Sizes, workers: Workers) -> list[Row]:
         loaded: dict[str, Loaded] = {}
         for dtype in DTYPES:
             compiled[f"jaxgrasp {dtype}"] = ours.margins(n_c, BATCH, dtype, devices(), mapped=False)
-            if find_spec("qpax"):
-                compiled[f"qpax {dtype}"] = ours.qpax(programs[: _count("qpax", n_c)], dtype, devices())
         for peer, distribution in peers.PEERS.items():
             if find_spec(distribution):
                 loaded[peer] = workers.load(peer, programs[: _count(peer, n_c)])
         jobs |= {name: it.run for name, it in compiled.items()} | {name: it.run for name, it in loaded.items()}
         timings = by_turns(jobs, sizes.peer_rounds)
         for name, timing in timings.items():
-            seconds = None
             if name in compiled:
-                seconds = compiled[name].compile_seconds
-                ready = "qpax" in name
-                answers = np.asarray(compiled[name].out, float) if ready else _scaled(compiled[name], programs)
+                answers, seconds = _scaled(compiled[name], programs), compiled[name].compile_seconds
             else:
                 answers = loaded[name].answers
+                seconds = loaded[name].setup_seconds if "qpax" in name else None
             rows.append({"n_c": n_c, **_row(name, timing, len(answers), answers, reference, seconds)})
     return rows
 

@@ -55,13 +55,16 @@ class Loaded:
 
     def __init__(self, pipes: list[Connection], count: int) -> None:
         self._pipes, self.count = pipes, count
-        self._keys = [pipe.recv() for pipe in pipes]
+        ready = [pipe.recv() for pipe in pipes]
+        self._peer = ready[0][0]
+        self.setup_seconds = max(seconds for _, seconds in ready)
+        """Import, workspaces and, where there is any, compilation."""
         self.answers = np.full(count, np.nan)
 
     def run(self) -> float:
         """Solve everything once; seconds of processor time that the workers took together."""
-        for pipe, key in zip(self._pipes, self._keys, strict=True):
-            pipe.send((key, None))
+        for pipe in self._pipes:
+            pipe.send((self._peer, None))
         replies = [pipe.recv() for pipe in self._pipes]
         self.answers = np.concatenate([answers for answers, _ in replies])
         return sum(cpu for _, cpu in replies)
@@ -75,8 +78,9 @@ def _work(pipe: Connection) -> None:
         except EOFError:
             return
         if batch is not None:
+            start = time.perf_counter()
             loaded[peer] = getattr(peers, peer)(batch)
-            pipe.send(peer)
+            pipe.send((peer, time.perf_counter() - start))
             continue
         start = time.process_time()
         answers = loaded[peer]()

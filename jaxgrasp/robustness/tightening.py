@@ -245,8 +245,10 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
         tuple(share * x + (1 - share) * c for x, c in zip(record.x, centre, strict=True)),
     )
     active = grasps.valid & ~program.wrench_outside & held & (first.status != Status.INFEASIBLE)
-    outcome = interior_point.solve(problem, settings, active)
-    best = outcome.record
+    # Without a load and a margin no forces at all are the answer, exactly.
+    idle = active & (fold(jnp.maximum, jnp.abs(program.rhs)) == 0) & (wanted == 0) & (grasps.reserve == 0)
+    outcome = interior_point.solve(problem, settings, active & ~idle)
+    best = jax.tree.map(lambda x: jnp.where(idle, 0, x), outcome.record)
     gap = (best.upper - best.lower) / problem.gap_scale(best)
     closed = gap <= _ACCEPTED_GAP[dtype.name]
 
