@@ -38,6 +38,7 @@ def main() -> None:
     results["processes"] = fresh.processes(everything=not options.quick)
     with Workers(sections.PROCESSES) as workers:
         results["headline"] = sections.headline(sizes, workers)
+        sections.prepare(sizes)
         results["against_peers"] = sections.against_peers(sizes, workers)
     results["scaling"] = sections.scaling(sizes)
     results["worst_cases"] = sections.worst_cases(sizes)

@@ -34,10 +34,6 @@ def spent(command: list[str]) -> tuple[float, float]:
     return seconds, usage.ru_maxrss / 1024
 
 
-def role(*words: str) -> tuple[float, float]:
-    return spent(["-m", "benchmarks.suite.fresh", *words])
-
-
 def million_candidates(count: int) -> tuple[float, float]:
     """The same of `jaxgrasp rank` on a file of candidates, table written, no figure."""
     with tempfile.TemporaryDirectory() as folder:
@@ -53,22 +49,25 @@ def million_candidates(count: int) -> tuple[float, float]:
 def processes(*, everything: bool) -> list[dict]:
     """Fresh processes: time to the first answer, peak memory."""
     say("Fresh processes")
-    small = str(MEMORY_BATCH)
-    jobs = {"imports only": ("imports", "float32", "1")}
-    for dtype in ("float64", "float32"):
-        jobs[f"first answer, jit, {dtype}"] = ("jit", dtype, "64")
-        jobs[f"first answer, direct call, {dtype}"] = ("direct", dtype, "64")
-        jobs[f"jaxgrasp {dtype}, {small} programs"] = ("jit", dtype, small)
-        if everything:
-            jobs[f"jaxgrasp {dtype}, {LARGE_BATCH} programs"] = ("jit", dtype, str(LARGE_BATCH))
-    for peer, distribution in peers.PEERS.items():
-        if find_spec(distribution) and everything and peer != "osqp":
-            jobs[f"{peer}, {small} programs"] = ("peer", peer)
     rows = []
-    for name, words in jobs.items():
-        runs = [role(*words) for _ in range(2 if "first" in name else 1)]
-        rows.append({"what": name, "seconds": min(s for s, _ in runs), "peak_mib": min(m for _, m in runs)})
+
+    def add(what: str, runs: int, *command: str) -> None:
+        spent_by_each = [spent(["-m", *command]) for _ in range(runs)]
+        seconds, peak = (min(each) for each in zip(*spent_by_each, strict=True))
+        rows.append({"what": what, "seconds": seconds, "peak_mib": peak})
+
+    first = "benchmarks.suite.first"
+    add("imports and contacts only", 1, first, "nothing", "float32", "64")
+    add("first answer, jit, float32", 2 if everything else 1, first, "jit", "float32", "64")
+    add("first answer, direct call, float32", 1, first, "direct", "float32", "64")
     if everything:
+        add("first answer, jit, float64", 2, first, "jit", "float64", "64")
+        for dtype in ("float64", "float32"):
+            add(f"jaxgrasp {dtype}, {LARGE_BATCH} programs", 1, first, "jit", dtype, str(LARGE_BATCH))
+        for peer, distribution in peers.PEERS.items():
+            # OSQP needs minutes for as many.
+            if find_spec(distribution) and peer != "osqp":
+                add(f"{peer}, {MEMORY_BATCH} programs", 1, "benchmarks.suite.fresh", peer)
         seconds, peak = million_candidates(CANDIDATES)
         rows.append({"what": f"jaxgrasp rank, {CANDIDATES} candidates", "seconds": seconds, "peak_mib": peak})
     for row in rows:
@@ -76,24 +75,8 @@ def processes(*, everything: bool) -> list[dict]:
     return rows
 
 
-def _main(what: str, *words: str) -> None:
-    if what == "peer":
-        batch = problems.programs(problems.sample(MEMORY_BATCH, 4))
-        getattr(peers, words[0])(batch)()
-        return
-    dtype, count = words[0], int(words[1])
-    import jax
-
-    jax.config.update("jax_enable_x64", dtype == "float64")
-    import jaxgrasp as jg
-    from benchmarks.suite import ours
-
-    grasps = problems.sample(count, 4)
-    contacts, disturbances = ours.contacts(grasps, dtype), jg.DisturbanceSet.forces(1.0)
-    if what == "jit":
-        jax.block_until_ready(jax.jit(jg.largest_disturbance)(contacts, disturbances))
-    if what == "direct":
-        jax.block_until_ready(jg.largest_disturbance(contacts, disturbances))
+def _main(peer: str) -> None:
+    getattr(peers, peer)(problems.programs(problems.sample(MEMORY_BATCH, 4)))()
 
 
 if __name__ == "__main__":

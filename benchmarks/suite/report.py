@@ -27,10 +27,11 @@ method; the explicit one ends nowhere there) and jaxgrasp (its defaults). All ta
 regularisation beside their own; ProxQP with a proximal step of 1e-3 and infeasibility tolerances of 1e-8, since its
 defaults call a share of these programs infeasible; OSQP stops after 20,000 iterations. `solved` is what the solver
 calls solved; errors are against HiGHS at 1e-10, relative to max(Lambda, |lambda|), and `right` is the share within
-1e-6. Times are the best of several rounds, all jobs of a table by turns, warm, compilation apart; rounds that took 15 %
-longer than the best count as noisy. `cpu/wall` is the processor time a second: two where both cores worked. Fresh
-processes come first, while nothing else runs; `direct call` is `largest_disturbance` without `jax.jit` around it. The
-peak for S_1 and S_2 is what a large matrix product of NumPy reaches by turns with them.
+1e-6. Times are the best of several rounds, all jobs of a table by turns, warm, compilation apart (two programs at a
+time but for the first table); rounds that took 15 % longer than the best count as noisy. `cpu/wall` is the processor
+time a second: two where both cores worked. Fresh processes come first, while nothing else runs; `direct call` is
+`largest_disturbance` without `jax.jit` around it. The peak for S_1 and S_2 is what a large matrix product of NumPy
+reaches by turns with them.
 """
 
 

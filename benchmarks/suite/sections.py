@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -45,9 +46,15 @@ class Sizes:
     directions: tuple[int, ...] = (6, 64, 512, 4096)
     rounds: int = 7
     peer_rounds: int = 3
+    alone: bool = True
+    """Time one device, too."""
+
+    def shapes(self) -> list[tuple[int, int]]:
+        """(n_c, batch) of what is timed of ours by itself."""
+        return sorted({(4, batch) for batch in self.ladder} | {(n_c, BATCH) for n_c in (4, *self.n_c)})
 
 
-QUICK = Sizes(n_c=(4,), ladder=(1, 4096), directions=(4096,), rounds=5, peer_rounds=2)
+QUICK = Sizes(n_c=(4,), batch=BATCH, ladder=(BATCH,), directions=(4096,), rounds=5, peer_rounds=2, alone=False)
 
 
 def devices() -> int:
@@ -67,7 +74,7 @@ def headline(sizes: Sizes, workers: Workers) -> list[Row]:
         say(f"  no C++ floor: {library}")
     for dtype in DTYPES:
         variants = {"": (devices(), False), ", vmap": (devices(), True), ", one device": (1, False)}
-        if devices() == 1:
+        if devices() == 1 or not sizes.alone:
             variants.pop(", one device")
         for name, (count, mapped) in variants.items():
             it = compiled[f"jaxgrasp {dtype}{name}"] = ours.margins(4, sizes.batch, dtype, count, mapped=mapped)
@@ -91,6 +98,19 @@ def headline(sizes: Sizes, workers: Workers) -> list[Row]:
         seconds = compiled[name].compile_seconds if name in compiled else None
         rows.append(_row(name, timing, counts.get(name, sizes.batch), answers, reference, seconds))
     return rows
+
+
+def prepare(sizes: Sizes) -> None:
+    """Compile what the next sections need, two at a time: one after the other takes most of the whole run."""
+    say("Compiling")
+    with ThreadPoolExecutor(2) as pool:
+        waiting = [
+            pool.submit(ours.margins, n_c, batch, dtype, _spread(batch), mapped=False)
+            for n_c, batch in sizes.shapes()
+            for dtype in DTYPES
+        ]
+    for it in waiting:
+        it.result()
 
 
 def against_peers(sizes: Sizes, workers: Workers) -> list[Row]:
@@ -125,10 +145,9 @@ def scaling(sizes: Sizes) -> list[Row]:
     say("Batch sizes and numbers of contacts")
     jobs: dict[str, Job] = {}
     about: dict[str, Row] = {}
-    shapes = {(4, batch) for batch in sizes.ladder} | {(n_c, BATCH) for n_c in (4, *sizes.n_c)}
     for dtype in DTYPES:
-        for n_c, batch in sorted(shapes):
-            spread = devices() if batch >= LEAST_SPREAD else 1
+        for n_c, batch in sizes.shapes():
+            spread = _spread(batch)
             compiled = ours.margins(n_c, batch, dtype, spread, mapped=False)
             name = f"{dtype}, n_c {n_c}, batch {batch}"
             jobs[name] = compiled.run
@@ -170,6 +189,10 @@ def worst_cases(sizes: Sizes) -> list[Row]:
         }
         for name, row in about.items()
     ]
+
+
+def _spread(batch: int) -> int:
+    return devices() if batch >= LEAST_SPREAD else 1
 
 
 def _square(matrix: np.ndarray) -> None:
