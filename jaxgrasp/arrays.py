@@ -69,7 +69,8 @@ def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
 
 def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
     """Euclidean norm whose gradient at 0 is 0."""
-    squares = jnp.sum(x * x, axis)
+    # Not a reduction: XLA's CPU backend hands large ones to a library, which a tile cannot call.
+    squares = fold(jnp.add, jnp.moveaxis(x * x, axis, 0))
     positive = squares > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
 

@@ -1,4 +1,4 @@
-"""A user's first minute: a fresh process that imports nothing but what it needs and solves one batch; see `fresh.py`."""
+"""A fresh process that imports nothing but what it needs and solves one batch; see `fresh.py`."""
 
 import sys
 

@@ -23,15 +23,16 @@ program's numbers: Clarabel, PIQP and OSQP by `update`, ProxQP by `update` or (p
 threads, HiGHS as many programs side by side in one call of SciPy as is fastest, qpax by `vmap`. All but the parallel
 one run in two processes, each with half of the programs. They are timed on a subsample, given as programs. Tolerances
 are the loosest at which lambda is right to 1e-6: 1e-6 for all but HiGHS (1e-7), qpax in float32 (1e-5, its implicit
-method; the explicit one ends nowhere there) and jaxgrasp (its defaults). All take an LP as it is, without any
-regularisation beside their own; ProxQP with a proximal step of 1e-3 and infeasibility tolerances of 1e-8, since its
-defaults call a share of these programs infeasible; OSQP stops after 20,000 iterations. `solved` is what the solver
-calls solved; errors are against HiGHS at 1e-10, relative to max(Lambda, |lambda|), and `right` is the share within
-1e-6. Times are the best of several rounds, all jobs of a table by turns, warm, compilation apart (two programs at a
-time but for the first table); rounds that took 15 % longer than the best count as noisy. `cpu/wall` is the processor
-time a second: two where both cores worked. Fresh processes come first, while nothing else runs; `direct call` is
-`largest_disturbance` without `jax.jit` around it. The peak for S_1 and S_2 is what a large matrix product of NumPy
-reaches by turns with them.
+method; the explicit one ends nowhere there) and jaxgrasp (its defaults). qpax in float64 is not quite as accurate,
+and at 1e-7 it leaves a third of the programs unsolved. All take an LP as it is, without any regularisation beside
+their own; ProxQP with a proximal step of 1e-3 and infeasibility tolerances of 1e-8, since its defaults call a share
+of these programs infeasible; OSQP stops after 20,000 iterations. `solved` is what the solver calls solved; errors are
+against HiGHS at 1e-10, relative to max(Lambda, |lambda|), and `right` is the share within 1e-6. Times are the best of
+several rounds, all jobs of a table by turns, warm, compilation apart (two programs at a time but for the first
+table); rounds that took 15 % longer than the best count as noisy. `cpu/wall` is the processor time a second: two
+where both cores worked. Fresh processes come first, while nothing else runs; `direct call` is `largest_disturbance`
+without `jax.jit` around it. The peak for S_1 and S_2 is what a large matrix product of NumPy reaches by turns with
+them.
 """
 
 
