@@ -29,7 +29,8 @@ def error(answers: np.ndarray, optimum: np.ndarray) -> np.ndarray:
     return np.abs(answers - optimum) / np.maximum(1.0, np.abs(optimum))
 
 
-@pytest.mark.parametrize("peer", peers.PEERS)
+# Not qpax: the tests ask for strict promotion of dtypes, which it does not keep.
+@pytest.mark.parametrize("peer", [peer for peer in peers.PEERS if "qpax" not in peer])
 def test_peers_solve_the_same_programs(peer: str, optimum: np.ndarray) -> None:
     pytest.importorskip(peers.PEERS[peer])
     answers = getattr(peers, peer)(problems.programs(problems.sample(GRASPS, 4))[:16])()
