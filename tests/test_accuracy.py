@@ -23,6 +23,8 @@ ROW_TOLERANCE = 1e-8
 """Of f_max: forces that a hand is told to apply satisfy every row."""
 
 UNSOLVED_EFFORTS = 5e-3
+"""Of a group: a known shortfall of (22), not a goal: the aim is none."""
+
 EFFORT_TOLERANCE = 1e-7
 """Of max(effort, 1e-3 f_max^2), with the mean of the contacts' largest forces where they differ."""
 

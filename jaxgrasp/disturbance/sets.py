@@ -122,10 +122,9 @@ class DisturbanceSet:
         directions = as_float("directions", directions, ("rows", 6))
         batch = broadcast_batch(directions=directions.shape[:-2], disturbances=self.batch_shape)
         rows = jnp.broadcast_to(directions, (*batch, *directions.shape[-2:]))
-        leaves = jax.tree.map(lambda x: x, self.spread_over(batch))
         lead = len(batch)
         to_last = lambda x: jnp.moveaxis(x, tuple(range(lead)), tuple(range(-lead, 0))) if lead else x  # noqa: E731
-        terms = jax.tree.map(to_last, leaves).terms
+        terms = jax.tree.map(to_last, self.spread_over(batch)).terms
         value = support(terms, jnp.moveaxis(to_last(rows), 1, 0))
         return jnp.moveaxis(value, tuple(range(-lead, 0)), tuple(range(lead))) if lead else value
 
@@ -135,7 +134,7 @@ class DisturbanceSet:
 
 
 def support(terms: tuple[Term, ...], directions: jax.Array) -> jax.Array:
-    """H of a sum of sets, the sum of theirs; components leading, (6, ..., *lanes) -> (..., *lanes)."""
+    """Support function of a sum of sets, the sum of theirs; components leading, (6, ..., *lanes) -> (..., *lanes)."""
     total = jnp.zeros(directions.shape[1:], directions.dtype)
     for term in terms:
         total = total + term.support(directions)
