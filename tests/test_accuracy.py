@@ -22,9 +22,6 @@ BOUND_TOLERANCE = 1e-9
 ROW_TOLERANCE = 1e-8
 """Of f_max: forces that a hand is told to apply satisfy every row."""
 
-UNSOLVED_EFFORTS = 5e-3
-"""Of a group: a known shortfall of (22), not a goal: the aim is none."""
-
 EFFORT_TOLERANCE = 1e-7
 """Of max(effort, 1e-3 f_max^2), with the mean of the contacts' largest forces where they differ."""
 
@@ -163,11 +160,9 @@ class TestLeastEffort:
             error[lane] = abs(ours.effort[lane] - truth[lane]) / unit
             violation[lane] = oracles.row_violation(grasp, ours.forces[lane][on], margin[lane])
         solved = ours.status == jg.Status.SOLVED
-        wrong = asked & solved & ~((error <= EFFORT_TOLERANCE) & (violation <= ROW_TOLERANCE))
+        wrong = asked & ~(solved & (error <= EFFORT_TOLERANCE) & (violation <= ROW_TOLERANCE))
         columns = {"status": ours.status, "margin": margin, "effort": ours.effort, "Clarabel": truth}
         assert not wrong.any(), harness.tell(group, wrong, **columns, error=error, violation=violation)
-        # Known shortfall: where rows that no disturbance loads leave no interior, some lanes stay unsolved, and say so.
-        assert np.mean(asked & ~solved) <= UNSOLVED_EFFORTS, harness.tell(group, asked & ~solved, **columns)
 
     def test_without_a_load_and_a_margin_nothing_is_to_be_done(self, name):
         group, (ours, margin) = problems.group(name), efforts(name)

@@ -234,8 +234,9 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     problem = MarginProblem((blocks,), program.rhs, program.dropped, program.radius, refinements)
     centre = problem.start().x[0]
     attained = problem.attained(centre)
+    # Where the start misses rows that lambda does not move, it attains nothing.
     share = (wanted - attained) / jnp.maximum(record.lower - attained, 1e-3)
-    share = 0.5 * (1 + jnp.clip(share, 0, 1))
+    share = 0.5 * (1 + jnp.where(jnp.isfinite(attained), jnp.clip(share, 0, 1), 0))
     problem = EffortProblem(
         (blocks._replace(h=blocks.h - sigma * wanted, hessian=root / largest),),
         program.rhs,
