@@ -26,10 +26,10 @@ _SETTINGS = {
 }
 _EFFORT_SETTINGS = {
     "float64": interior_point.Settings(
-        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=0.0, patience=3
+        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
     ),
     "float32": interior_point.Settings(
-        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=3
+        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=5
     ),
 }
 _REFINEMENTS = {"float64": 0, "float32": 1}
