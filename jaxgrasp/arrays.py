@@ -75,6 +75,7 @@ def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
 
 
+@jax.jit
 def frames_from_normals(normals: jax.Array) -> jax.Array:
     """Contact frames (t1, t2, n) of unit normals: the x and y axes turned by the smallest rotation that takes z to n.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -32,14 +32,12 @@ def data_of(batch: problems.Batch, dtype=jnp.float64) -> tuple:
     return contacts_of(batch, dtype), jg.DisturbanceSet.vertices(vertices), load, reserve
 
 
-@partial(jax.jit, static_argnames="cone_edges")
 def largest(contacts, disturbances, required_wrench, cone_margin, cone_edges=8):
     return jg.largest_disturbance(
         contacts, disturbances, required_wrench=required_wrench, cone_edges=cone_edges, cone_margin=cone_margin
     )
 
 
-@partial(jax.jit, static_argnames="cone_edges")
 def least(contacts, disturbances, required_wrench, cone_margin, margin, cone_edges=8):
     return jg.least_effort(
         contacts, disturbances, margin, required_wrench=required_wrench, cone_edges=cone_edges, cone_margin=cone_margin

@@ -15,6 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from test_identities import sample
 
 import jaxgrasp as jg
+from jaxgrasp.compiling import compiled
 
 SAME = 1e-12
 """Relative: another arrangement of the lanes may contract multiplications and additions differently, not more."""
@@ -188,11 +189,20 @@ def test_a_second_direct_call_compiles_nothing(batch, compilations):
 def test_vmap_costs_what_the_direct_batch_costs():
     some = problems.make_family(99, TIMED_LANES, 4, problems.Setting(closure="around"), 6)
     data = harness.data_of(some)
-    mapped = jax.jit(jax.vmap(largest))
+    direct, mapped = jax.jit(largest), jax.jit(jax.vmap(largest))
     best = {"direct": np.inf, "mapped": np.inf}
     for _ in range(TIMED_ROUNDS):
-        for name, solve in (("direct", largest), ("mapped", mapped)):
+        for name, solve in (("direct", direct), ("mapped", mapped)):
             start = time.perf_counter()
             jax.block_until_ready(solve(*data))
             best[name] = min(best[name], time.perf_counter() - start)
     assert best["mapped"] <= VMAP_COST * best["direct"], best
+
+
+def test_the_compilers_options_do_not_stand_in_the_way():
+    """JAX takes options for whole programs only; who nests a call, or differentiates it, need not know."""
+    x = jnp.linspace(0.0, 1.0, 3)
+    sine = compiled(jnp.sin)
+    np.testing.assert_allclose(jax.jit(lambda: sine(x))(), sine(x))
+    np.testing.assert_allclose(jax.jit(lambda x: sine(x))(x), sine(x))
+    np.testing.assert_allclose(jax.vmap(jax.grad(sine))(x), jnp.cos(x))

@@ -9,6 +9,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "jaxgrasp"
 
 FLOORS = {
     "arrays": 0,
+    "compiling": 0,
     "fence": 0,
     "geometry": 1,
     "contact": 1,

@@ -14,9 +14,7 @@ from jax.sharding import PartitionSpec as P
 
 import jaxgrasp as jg
 from benchmarks.suite.problems import FRICTION, MAX_FORCE, Grasps, sample
-
-# Wider vectors than XLA's default on CPUs; an internal option, so it is left out where XLA does not know it.
-OPTIONS = {"xla_cpu_prefer_vector_width": 512}
+from jaxgrasp.compiling import options
 
 
 class Compiled:
@@ -33,22 +31,13 @@ class Compiled:
             jax.device_put(shared, NamedSharding(mesh, P())),
         )
         start = time.perf_counter()
-        self._call = _compile(function, self._arguments)
+        self._call = jax.jit(function, compiler_options=options()).lower(*self._arguments).compile()
         self.compile_seconds = time.perf_counter() - start
         self.out: Any = None
         self.run()
 
     def run(self) -> None:
         self.out = jax.block_until_ready(self._call(*self._arguments))
-
-
-def _compile(function: Callable, arguments: tuple) -> Callable:
-    if jax.default_backend() == "cpu":
-        try:
-            return jax.jit(function, compiler_options=OPTIONS).lower(*arguments).compile()
-        except jax.errors.JaxRuntimeError as error:
-            print(f"  without the compiler's option for wide vectors: {str(error).splitlines()[0]}", flush=True)
-    return jax.jit(function).lower(*arguments).compile()
 
 
 def contacts(grasps: Grasps, dtype: str) -> jg.Contacts:

@@ -13,6 +13,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array
 
 from jaxgrasp.candidates import Candidates
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts, required_wrench
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness import largest_disturbance, least_effort
@@ -93,7 +94,7 @@ def tightening(
     return solution.forces, solution.forces_in_object_frame(contacts), solution.effort, solution.status
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
+@functools.partial(compiled, static_argnums=(3, 4, 5, 6))
 def _solve_tile(
     columns: Any, disturbances: DisturbanceSet, gravity: Any, solver: Any, cone_edges: int, loaded: bool, mesh: Mesh
 ) -> Any:

@@ -30,7 +30,7 @@ def blocking_forces(
     Raises:
         ValueError: shapes that do not fit.
     """
-    return over_grasps(_blocking_kernel, contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
+    return over_grasps((_blocking_kernel,), contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
 
 
 def _blocking_kernel(grasps: Grasps) -> jax.Array:

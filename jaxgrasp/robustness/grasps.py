@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgrasp.arrays import as_float, broadcast_batch, fold
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.grasp_map import grasp_columns
@@ -18,6 +19,7 @@ from jaxgrasp.disturbance.terms import Term, Vertices
 from jaxgrasp.solvers.lanes import map_lanes
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class Grasps:
     """Grasps in lanes (the trailing axis), made safe: what is absent or not admissible is replaced by harmless data.
@@ -60,7 +62,7 @@ class Grasps:
 
 
 def over_grasps(
-    kernel: Callable[..., Any],
+    stages: tuple[Callable[..., Any], ...],
     contacts: Contacts,
     disturbances: DisturbanceSet,
     *options: int,
@@ -70,9 +72,10 @@ def over_grasps(
     effort_weights: Any = None,
     margin: Any = None,
 ) -> Any:
-    """Check shapes, run `kernel(grasps, *options)` over all grasps of a batch and give its results the batch's shape.
+    """Check shapes, run a kernel over all grasps of a batch and give its results the batch's shape.
 
-    The contacts' dtype is the precision of everything. Compiled once for a kernel, its options and the shapes.
+    The kernel's first stage is called with (grasps, *options), see `map_lanes`. The contacts' dtype is the precision of
+    everything. Compiled once for a kernel, its options and the shapes.
 
     Raises:
         ValueError: shapes or kinds of argument that do not fit.
@@ -91,13 +94,11 @@ def over_grasps(
     for name, value in given.items():
         if value is not None and not isinstance(value, Compliance):
             given[name] = as_float(name, value, ())
-    return _run(kernel, options, contacts, disturbances, given)
+    return _run(stages, options, contacts, disturbances, given)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _run(
-    kernel: Callable[..., Any], options: tuple, contacts: Contacts, disturbances: DisturbanceSet, given: dict
-) -> Any:
+@functools.partial(compiled, static_argnums=(0, 1))
+def _run(stages: tuple, options: tuple, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Any:
     """Lay the arguments out for `map_lanes`: which leaves have the batch axes, and which all grasps share."""
     required_wrench, compliance, cone_margin = given["required_wrench"], given["compliance"], given["cone_margin"]
     effort_weights, margin = given["effort_weights"], given["margin"]
@@ -139,11 +140,11 @@ def _run(
     def run(raw: dict[str, jax.Array]) -> Any:
         terms = jax.tree.unflatten(structure, [raw[f"term {i}"] for i in range(structure.num_leaves)])
         extents = tuple(raw[f"extent {i}"] for i in range(len(terms.terms)))
-        return kernel(_admit(raw, terms.terms, extents), *options)
+        return stages[0](_admit(raw, terms.terms, extents), *options)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
     compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
-    out = map_lanes(run, arguments, shared, n, compact=compact)
+    out = map_lanes((run, *stages[1:]), arguments, shared, n, compact=compact)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 

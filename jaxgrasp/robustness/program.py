@@ -7,7 +7,7 @@ are dropped.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -25,18 +25,25 @@ from jaxgrasp.solvers.block_kkt import Blocks
 _LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class Program:
     """Scaled data of a batch of grasps; lanes trail."""
 
-    blocks: Blocks
-    """Contacts with their rows: n_e facets, then the bound on the normal force."""
+    cone_edges: int = field(metadata={"static": True})
+    """n_e."""
+    columns: jax.Array
+    """(6, 3, n, *lanes), the orthonormal rows of G; zero where dropped or absent."""
+    sigma: jax.Array
+    """(n_e + 1, n, *lanes), what the disturbances take from the rows of C and E, scaled."""
+    h: jax.Array
+    """(n_e + 1, n, *lanes), right-hand sides."""
+    present: jax.Array
+    """(n, *lanes), 1 or 0."""
     rhs: jax.Array
     """(6, *lanes), coordinates of b in the orthonormal rows; zero where dropped."""
     dropped: jax.Array
     """(6, *lanes), 1 where a row of G was dropped."""
-    radius: float
-    """|x|_inf <= 1 + radius * max(0, -lambda_hat) at the optimum."""
     scale: jax.Array
     """Lambda, (*lanes), N per unit of disturbance."""
     tangential: jax.Array
@@ -60,14 +67,33 @@ class Program:
     slippery: jax.Array
     """bool (*lanes): a contact without friction has to bear tangential force, so the margin cannot be positive."""
 
+    @property
+    def blocks(self) -> Blocks:
+        """Contacts with their rows: n_e facets, then the bound on the normal force."""
+        patterns = np.concatenate([pyramid_facets(self.cone_edges), [[0.0, 0.0, -1.0]]])
+        return Blocks(
+            patterns=literal(patterns, self.h.dtype),
+            columns=self.columns,
+            sigma=self.sigma,
+            h=self.h,
+            present=self.present,
+            hessian=None,
+            start=literal(np.array([0.0, 0.0, -0.6]), self.h.dtype),
+        )
+
+    @property
+    def radius(self) -> float:
+        """|x|_inf <= 1 + radius * max(0, -lambda_hat) at the optimum."""
+        return 1 + 1 / math.cos(math.pi / self.cone_edges)
+
     def forces(self, x: jax.Array) -> jax.Array:
         """Contact forces (n, 3, *lanes), N, from scaled ones (3, n, *lanes)."""
         return jnp.stack([x[0] * self.tangential, x[1] * self.tangential, x[2] * self.normal], 1)
 
     def row_units(self) -> jax.Array:
         """What one unit of every scaled row is in newtons, (n_e + 1, n, *lanes)."""
-        edges = self.blocks.sigma.shape[0] - 1
-        return jnp.concatenate([jnp.broadcast_to(self.tangential, (edges, *self.tangential.shape)), self.normal[None]])
+        edges = jnp.broadcast_to(self.tangential, (self.cone_edges, *self.tangential.shape))
+        return jnp.concatenate([edges, self.normal[None]])
 
     def wrench_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
         """Multipliers of G f = b (6, *lanes) from those of the orthonormal rows, per unit of the scaled objective."""
@@ -107,20 +133,14 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     coordinates, kept = rows.coordinates(wrench), rows.kept
     largest = fold(jnp.maximum, jnp.abs(wrench))
     outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > 10 * RANK_TOLERANCE[dtype.name] * largest
-    patterns = np.concatenate([pyramid_facets(cone_edges), [[0.0, 0.0, -1.0]]])
     return Program(
-        blocks=Blocks(
-            patterns=literal(patterns, dtype),
-            columns=rows.rows,
-            sigma=sigma,
-            h=h,
-            present=present,
-            hessian=None,
-            start=literal(np.array([0.0, 0.0, -0.6]), dtype),
-        ),
+        cone_edges=cone_edges,
+        columns=rows.rows,
+        sigma=sigma,
+        h=h,
+        present=present,
         rhs=coordinates * kept,
         dropped=1 - kept,
-        radius=1 + 1 / math.cos(math.pi / cone_edges),
         scale=scale,
         tangential=tangential,
         normal=normal,

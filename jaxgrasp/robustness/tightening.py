@@ -1,5 +1,7 @@
 """Tightening forces: the largest-minimum resisted disturbance (21) and the least effort (22)."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -73,7 +75,7 @@ def largest_disturbance(
     """
     pyramid_facets(cone_edges)
     return over_grasps(
-        _margin_kernel,
+        (_prepare, _solve_margin_alone),
         contacts,
         disturbances,
         cone_edges,
@@ -122,7 +124,7 @@ def least_effort(
     """
     pyramid_facets(cone_edges)
     return over_grasps(
-        _effort_kernel,
+        (_prepare, _solve_both),
         contacts,
         disturbances,
         cone_edges,
@@ -134,13 +136,17 @@ def least_effort(
     )
 
 
-def _margin_kernel(grasps: Grasps, cone_edges: int) -> Solution:
-    return _solve_margin(grasps, scaled_program(grasps, cone_edges))[0]
-
-
-def _effort_kernel(grasps: Grasps, cone_edges: int) -> Solution:
+def _prepare(grasps: Grasps, cone_edges: int) -> tuple[Grasps, Program]:
     program = scaled_program(grasps, cone_edges)
-    return _solve_effort(grasps, program, *_solve_margin(grasps, program))
+    return replace(grasps, terms=(), extents=()), program
+
+
+def _solve_margin_alone(prepared: tuple[Grasps, Program]) -> Solution:
+    return _solve_margin(*prepared)[0]
+
+
+def _solve_both(prepared: tuple[Grasps, Program]) -> Solution:
+    return _solve_effort(*prepared, *_solve_margin(*prepared))
 
 
 def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:

@@ -43,7 +43,7 @@ def worst_case(
     """
     pyramid_facets(cone_edges)
 
-    return over_grasps(_worst_kernel, contacts, disturbances, cone_edges, compliance=compliance)
+    return over_grasps((_worst_kernel,), contacts, disturbances, cone_edges, compliance=compliance)
 
 
 def _worst_kernel(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array]:

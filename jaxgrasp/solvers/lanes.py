@@ -25,19 +25,22 @@ LARGEST_LEAF = 1 << 15
 LARGE_TILE = 1 << 17
 
 
-def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree, blocks: int, *, compact: bool) -> Tree:
+def map_lanes(
+    stages: tuple[Callable[[Tree], Tree], ...], arguments: Tree, shared: Tree, blocks: int, *, compact: bool
+) -> Tree:
     """Run a kernel over the leading axis of its arguments.
 
     Args:
-        kernel: takes the tree of arguments with the lane axis last (size 1 where shared), returns a tree of arrays with
-            the lane axis last.
+        stages: the kernel, in parts that are compiled by themselves and at the same time: the first takes the tree of
+            arguments with the lane axis last (size 1 where shared), each other one what the one before returns.
         arguments: leaves (lanes, ...), or without the leading axis where shared.
         shared: like arguments, bool: the leaf is the same for all lanes.
-        compact: the kernel is free of library calls and large reductions, so that a tile can be one function on CPUs.
+        compact: the kernel is free of library calls and large reductions, so that a stage of a tile can be one function
+            on CPUs.
         blocks: how many blocks (contacts) a lane has, which sets the size of a tile.
 
     Returns:
-        The kernel's tree, leaves (lanes, ...).
+        What the last stage returns, leaves (lanes, ...).
     """
     leaves, structure = jax.tree.flatten(arguments)
     if any(x.size == 0 for x in leaves):
@@ -45,15 +48,15 @@ def map_lanes(kernel: Callable[[Tree], Tree], arguments: Tree, shared: Tree, blo
             x if s else jnp.zeros((1, *x.shape[1:]), x.dtype)
             for x, s in zip(leaves, jax.tree.leaves(shared), strict=True)
         ]
-        shapes = jax.eval_shape(_run(kernel, structure, tuple(jax.tree.leaves(shared)), 0), one)
+        shapes = jax.eval_shape(_run(stages, structure, tuple(jax.tree.leaves(shared)), 0), one)
         return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), shapes)
-    return _run(kernel, structure, tuple(jax.tree.leaves(shared)), blocks if compact else 0)(leaves)
+    return _run(stages, structure, tuple(jax.tree.leaves(shared)), blocks if compact else 0)(leaves)
 
 
-def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int) -> Callable:
+def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], blocks: int) -> Callable:
     @custom_vmap
     def run(leaves: list[jax.Array]) -> Tree:
-        return _tiled(kernel, structure, shared, blocks, leaves)
+        return _tiled(stages, structure, shared, blocks, leaves)
 
     @run.def_vmap
     def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
@@ -70,19 +73,32 @@ def _run(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int
             elif not is_batched:
                 leaf = jnp.broadcast_to(leaf[None], (size, *leaf.shape))
             merged.append(leaf.reshape(size * lanes, *leaf.shape[2:]))
-        out = _run(kernel, structure, tuple(still_shared), blocks)(merged)
+        out = _run(stages, structure, tuple(still_shared), blocks)(merged)
         out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     return run
 
 
-def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: int, leaves: list[jax.Array]) -> Tree:
+def _tiled(
+    stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], blocks: int, leaves: list[jax.Array]
+) -> Tree:
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
 
-    def solve(parts: list[jax.Array]) -> Tree:
+    def enter(parts: list[jax.Array]) -> Tree:
         last = [x[..., None] if s else jnp.moveaxis(x, 0, -1) for x, s in zip(parts, shared, strict=True)]
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), kernel(jax.tree.unflatten(structure, last)))
+        return stages[0](jax.tree.unflatten(structure, last))
+
+    def leave(value: Tree) -> Tree:
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), value)
+
+    steps = [enter, *stages[1:]]
+    steps[-1] = lambda value, last=steps[-1]: leave(last(value))
+
+    def solve(value: Tree) -> Tree:
+        for step in steps:
+            value = step(value)
+        return value
 
     def in_tiles(tile: int, one: Callable) -> Tree:
         count = math.ceil(lanes / tile)
@@ -100,11 +116,6 @@ def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: i
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
-        @jax.jit
-        def tile(parts: list[jax.Array]) -> tuple[Tree, list[jax.Array]]:
-            # XLA aborts where a parameter of such a function ends up unused, so each is handed on.
-            return solve(parts), [x.ravel()[0] for x in parts]
-
         size = min(1 << max(0, (TILE // max(blocks, 1)).bit_length() - 1), 64)
         largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
         compact = blocks > 0 and lanes > size and largest <= LARGEST_LEAF
@@ -114,9 +125,10 @@ def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: i
             with fences(True):
                 if not compact:
                     return solve(parts)
-                # XLA's CPU backend then emits the tile as one function, free of the overhead for every operation.
-                with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-                    return tile(parts)[0]
+                value = parts
+                for step in steps:
+                    value = _as_one_function(step, value)
+                return value
 
         return in_tiles(min(size, lanes), one)
 
@@ -126,3 +138,15 @@ def _tiled(kernel: Callable, structure: Any, shared: tuple[bool, ...], blocks: i
     if jax.default_backend() == "cpu":
         return on_cpu()
     return lax.platform_dependent(cpu=on_cpu, default=elsewhere)
+
+
+def _as_one_function(step: Callable[[Tree], Tree], value: Tree) -> Tree:
+    """XLA's CPU backend emits the step as one function, free of the overhead for every operation."""
+
+    @jax.jit
+    def run(value: Tree) -> tuple[Tree, list[jax.Array]]:
+        # XLA aborts where a parameter of such a function ends up unused, so each is handed on.
+        return step(value), [x.ravel()[0] for x in jax.tree.leaves(value)]
+
+    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        return run(value)[0]
