@@ -15,7 +15,9 @@ from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.program import Program, scaled_program
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.block_kkt import EffortProblem, MarginProblem, Record
+from jaxgrasp.solvers.block_kkt import Record
+from jaxgrasp.solvers.effort_problem import EffortProblem
+from jaxgrasp.solvers.margin_problem import MarginProblem
 from jaxgrasp.solvers.status import Status
 
 _SETTINGS = {

@@ -5,7 +5,7 @@ With blocks x_i (three forces of a contact, or one bounded actuator effort), a s
     A x_i + sigma_i lambda <= h_i      for every block i,
     sum_i E_i x_i = b                  (a static number of equality rows),
 
-`MarginProblem` maximises lambda, `EffortProblem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the
+`margin_problem` maximises lambda, `effort_problem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the
 same for every block of a group, so they are never stored. The Newton system is reduced block by block (k x k), then
 lambda, then the equality rows: the cost is linear in the number of blocks.
 
@@ -23,7 +23,6 @@ import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.fence import each, fenced, repeat
-from jaxgrasp.solvers.interior_point import Iterate, Residuals
 
 Rows = tuple[jax.Array, ...]
 
@@ -69,7 +68,9 @@ class _BlockFactor(NamedTuple):
     lean: jax.Array | None  # (n, *lanes), what of sigma'W sigma the unknowns of the block cannot make up for
 
 
-class _Factors(NamedTuple):
+class Factors(NamedTuple):
+    """The reduced Newton system; `border` and `v` are None where lambda is held."""
+
     blocks: list[_BlockFactor]
     root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of the equality rows' matrix
     weights: Rows
@@ -77,22 +78,22 @@ class _Factors(NamedTuple):
     v: jax.Array | None  # (eq, *lanes), lambda's column in the equality rows
 
 
-def _apply(group: Blocks, x: jax.Array) -> jax.Array:
+def apply_rows(group: Blocks, x: jax.Array) -> jax.Array:
     """A x: (k, n, *lanes) -> (m, n, *lanes)."""
-    return fold(jnp.add, _spread(group.patterns.T, x) * x[:, None])
+    return fold(jnp.add, spread_over(group.patterns.T, x) * x[:, None])
 
 
-def _adjoint(group: Blocks, z: jax.Array) -> jax.Array:
+def adjoint_rows(group: Blocks, z: jax.Array) -> jax.Array:
     """A'z: (m, n, *lanes) -> (k, n, *lanes)."""
-    return fold(jnp.add, _spread(group.patterns, z) * z[:, None])
+    return fold(jnp.add, spread_over(group.patterns, z) * z[:, None])
 
 
-def _spread(values: jax.Array, like: jax.Array) -> jax.Array:
+def spread_over(values: jax.Array, like: jax.Array) -> jax.Array:
     """Append axes, to weigh arrays of which `like` is one along its leading axis."""
     return values.reshape(values.shape + (1,) * (like.ndim - 1))
 
 
-def _total(x: jax.Array) -> jax.Array:
+def total(x: jax.Array) -> jax.Array:
     """Sum over rows and blocks, (m, n, *lanes) -> (*lanes), unrolled: XLA's CPU code then runs along the lanes."""
     return fold(jnp.add, fold(jnp.add, x))
 
@@ -102,7 +103,8 @@ def _over_blocks(x: jax.Array, axis: int) -> jax.Array:
     return fold(jnp.add, jnp.moveaxis(x, axis, 0))
 
 
-def _least(x: jax.Array) -> jax.Array:
+def least(x: jax.Array) -> jax.Array:
+    """Smallest over rows and blocks."""
     return fold(jnp.minimum, fold(jnp.minimum, x))
 
 
@@ -182,7 +184,7 @@ class BlockProblem:
     def equality(self, x: Rows) -> jax.Array:
         """E x, (eq, *lanes)."""
         products = [g.columns * x_g for g, x_g in zip(self.groups, x, strict=True)]
-        return fold(jnp.add, [_total(jnp.moveaxis(p, 0, 2)) for p in products])
+        return fold(jnp.add, [total(jnp.moveaxis(p, 0, 2)) for p in products])
 
     def pull_back(self, y: jax.Array) -> Rows:
         """E'y, (k, n, *lanes) a group."""
@@ -197,14 +199,14 @@ class BlockProblem:
         """Largest amount by which any row is missed, (*lanes)."""
         missed = fold(jnp.maximum, jnp.abs(self.equality(x) - self.rhs))
         for g, x_g in zip(self.groups, x, strict=True):
-            missed = jnp.maximum(missed, -_least(g.h - _apply(g, x_g) - g.sigma * lam))
+            missed = jnp.maximum(missed, -least(g.h - apply_rows(g, x_g) - g.sigma * lam))
         return missed
 
     def first_multipliers(self) -> tuple[jax.Array, Rows]:
         """Nothing, for a record."""
         return jnp.zeros_like(self.rhs), tuple(jnp.zeros_like(g.sigma) for g in self.groups)
 
-    def factor(self, weights: Rows) -> _Factors:
+    def factor(self, weights: Rows) -> Factors:
         """Eliminate blocks, then lambda."""
         blocks = [self._factor_block(g, w) for g, w in zip(self.groups, weights, strict=True)]
 
@@ -230,7 +232,7 @@ class BlockProblem:
             return matrix if v is None else matrix + v[:, None] * (v * border)
 
         matrix, v, border = reduce(blocks)
-        return _Factors(blocks, _inverse_root(complete(matrix, v, border)), weights, border, v)
+        return Factors(blocks, _inverse_root(complete(matrix, v, border)), weights, border, v)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
         """Orthogonalise sqrt(W) [A, sigma] column by column.
@@ -239,7 +241,7 @@ class BlockProblem:
         """
         k = g.patterns.shape[1]
         root = jnp.sqrt(weights)
-        columns = [root * _spread(g.patterns[:, a], root) for a in range(k)]
+        columns = [root * spread_over(g.patterns[:, a], root) for a in range(k)]
         if g.hessian is not None:
             columns = [jnp.concatenate([c, g.hessian[:, a]]) for a, c in enumerate(columns)]
         if self.bordered:
@@ -269,11 +271,11 @@ class BlockProblem:
         reduced = fenced(lambda below, inverse: _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
         return _BlockFactor(below, inverse, reduced(below, inverse), theta, lean)
 
-    def _newton(self, factors: _Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
+    def _newton(self, factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
         """Solve [P p E'; p' hll 0; E 0 0] (dx, dlambda, dy) = (rhs_x, rhs_lambda, rhs_y)."""
 
         @fenced
-        def eliminate(factors: _Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
+        def eliminate(factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
             reduced = [
                 _substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)
             ]
@@ -288,20 +290,20 @@ class BlockProblem:
             return reduced, right, rhs_lambda - fold(jnp.add, [fold(jnp.add, t * a) for _, t, a in pairs])
 
         @fenced
-        def solve_equalities(factors: _Factors, right: jax.Array, pull: jax.Array | None) -> jax.Array:
+        def solve_equalities(factors: Factors, right: jax.Array, pull: jax.Array | None) -> jax.Array:
             if self.bordered:
                 right = right + factors.v * (pull * factors.border)
             return fold(jnp.add, jnp.moveaxis(factors.root * right, 1, 0))
 
         @fenced
-        def finish_equalities(factors: _Factors, half: jax.Array, pull: jax.Array | None) -> tuple:
+        def finish_equalities(factors: Factors, half: jax.Array, pull: jax.Array | None) -> tuple:
             dy = fold(jnp.add, factors.root * half[:, None])
             if not self.bordered:
                 return dy, None
             return dy, (pull - fold(jnp.add, factors.v * dy)) * factors.border
 
         @fenced
-        def substitute(factors: _Factors, reduced: list, dy: jax.Array, dlambda: jax.Array | None) -> Rows:
+        def substitute(factors: Factors, reduced: list, dy: jax.Array, dlambda: jax.Array | None) -> Rows:
             out = []
             for f, r in zip(factors.blocks, reduced, strict=True):
                 left = [a - fold(jnp.add, c * dy[:, None]) for c, a in zip(f.columns, r, strict=True)]
@@ -313,239 +315,3 @@ class BlockProblem:
         reduced, right, pull = eliminate(factors, rhs_x, rhs_lambda, rhs_y)
         dy, dlambda = finish_equalities(factors, solve_equalities(factors, right, pull), pull)
         return substitute(factors, reduced, dy, dlambda), dlambda, dy
-
-
-@dataclass(frozen=True)
-class MarginProblem(BlockProblem):
-    """max lambda; x is (blocks, lambda).
-
-    Record: `lower` is attained by `x`, `upper` is certified by (y, z) with sum sigma z = 1.
-    """
-
-    def attained(self, x: Rows) -> jax.Array:
-        """Min (h - A x) / sigma, the lambda that x attains when E x = b.
-
-        It is -inf where a row with sigma = 0 is violated.
-        """
-        parts = []
-        for g, x_g in zip(self.groups, x, strict=True):
-            info = jnp.finfo(g.h.dtype)
-            # A row that lambda hardly moves may miss its right-hand side by a little more than rounding.
-            soft = g.h + jnp.where(g.sigma <= 1e4 * info.eps, max(8 * float(info.eps), 1e-11), 0)
-            parts.append(_least((soft - _apply(g, x_g)) / jnp.maximum(g.sigma, 4 * info.tiny)))
-        least = fold(jnp.minimum, parts)
-        return jnp.where(least < -1e12, -jnp.inf, least)
-
-    def start(self) -> Iterate:
-        """Light forces that meet E x = b, lambda well below what they attain, multipliers with A'z = 0."""
-        blocks = self.project(
-            tuple(
-                jnp.broadcast_to(_spread(g.start, g.columns[0]), g.columns.shape[1:]) * g.present for g in self.groups
-            )
-        )
-
-        @fenced
-        def attain(blocks: Rows) -> jax.Array:
-            ratios = []
-            for g, x in zip(self.groups, blocks, strict=True):
-                felt = g.sigma > 1e-3
-                ratios.append(_least(jnp.where(felt, (g.h - _apply(g, x)) / jnp.where(felt, g.sigma, 1), jnp.inf)))
-            low = fold(jnp.minimum, ratios)
-            low = jnp.where(jnp.isfinite(low), low, 0)
-            return low - jnp.maximum(jnp.abs(low), 0.1)
-
-        @fenced
-        def slacken(blocks: Rows, lam: jax.Array) -> Rows:
-            return tuple(g.h - _apply(g, x) - g.sigma * lam for g, x in zip(self.groups, blocks, strict=True))
-
-        @fenced
-        def spread(slacks: Rows) -> tuple:
-            floor = jnp.maximum(0.1, -fold(jnp.minimum, [_least(s) for s in slacks]))
-            s, z = [], []
-            for g, slack in zip(self.groups, slacks, strict=True):
-                kept = jnp.where(g.present > 0, jnp.maximum(slack, floor), 1)
-                balance = jnp.concatenate(
-                    [jnp.ones(kept.shape[0] - 1, kept.dtype), -jnp.sum(g.patterns[:-1, -1:], 0) / g.patterns[-1, -1:]]
-                )
-                mean = fold(jnp.add, kept[:-1]) / (kept.shape[0] - 1)
-                s.append(kept)
-                z.append(_spread(balance, kept) * (g.present / mean))
-            return tuple(s), tuple(z)
-
-        lam = attain(blocks)
-        s, z = spread(slacken(blocks, lam))
-        total = fold(jnp.add, [_total(g.sigma * z_g) for g, z_g in zip(self.groups, z, strict=True)])
-        return Iterate((blocks, lam), jnp.zeros_like(self.rhs), s, tuple(z_g / jnp.maximum(total, 1e-6) for z_g in z))
-
-    def residuals(self, iterate: Iterate) -> Residuals:
-        """Of stationarity in x and lambda, of E x = b and of the rows."""
-        blocks, lam = iterate.x
-        dual = tuple(
-            _adjoint(g, z) + e for g, z, e in zip(self.groups, iterate.z, self.pull_back(iterate.y), strict=True)
-        )
-        pull = fold(jnp.add, [_total(g.sigma * z) for g, z in zip(self.groups, iterate.z, strict=True)]) - 1
-        rows = tuple(
-            _apply(g, x) + g.sigma * lam + s - g.h for g, x, s in zip(self.groups, blocks, iterate.s, strict=True)
-        )
-        return Residuals((dual, pull), self.equality(blocks) - self.rhs, rows)
-
-    def solve(self, factors: _Factors, residuals: Residuals, shift: Rows) -> tuple:
-        """See `interior_point.Problem`."""
-
-        @fenced
-        def lacking(weights: Rows, dx: Rows, dlambda: jax.Array, dy: jax.Array, rows: Rows) -> tuple:
-            """The right-hand side, less what the direction found so far makes of the left."""
-            dual, pull = residuals.dual
-            shifts = tuple(e + w * r for e, w, r in zip(shift, weights, rows, strict=True))
-            rhs_x = tuple(
-                -d - _adjoint(g, e) - t
-                for g, d, e, t in zip(self.groups, dual, shifts, self.pull_back(dy), strict=True)
-            )
-            rhs_lambda = -pull - fold(jnp.add, [_total(g.sigma * e) for g, e in zip(self.groups, shifts, strict=True)])
-            return rhs_x, rhs_lambda, -residuals.primal - self.equality(dx)
-
-        @fenced
-        def change(dx: Rows, dlambda: jax.Array) -> Rows:
-            return tuple(_apply(g, d) + g.sigma * dlambda for g, d in zip(self.groups, dx, strict=True))
-
-        def improve(_: jax.Array, state: tuple) -> tuple:
-            (dx, dlambda), dy, rows = state
-            more_x, more_lambda, more_y = self._newton(factors, *lacking(factors.weights, dx, dlambda, dy, rows))
-            dx = tuple(d + m for d, m in zip(dx, more_x, strict=True))
-            return (dx, dlambda + more_lambda), dy + more_y, change(dx, dlambda + more_lambda)
-
-        zero = jax.tree.map(jnp.zeros_like, (residuals.dual, residuals.primal, residuals.rows))
-        return repeat(1 + self.refinements, improve, zero)
-
-    def first_record(self) -> Record:
-        """Nothing is known."""
-        inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
-        x = tuple(jnp.zeros_like(g.columns[0]) for g in self.groups)
-        return Record(-inf, inf, x, *self.first_multipliers())
-
-    def gap_scale(self, record: Record) -> jax.Array:
-        """Gaps count relative to max(1, |lambda|).
-
-        Where no x attains anything, a negative upper bound says all there is to know.
-        """
-        hopeless = jnp.isinf(record.lower) & (record.upper < -1e-6)
-        return jnp.where(
-            hopeless, jnp.inf, jnp.maximum(1, jnp.where(jnp.isinf(record.lower), 1, jnp.abs(record.lower)))
-        )
-
-    def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
-        """Both bounds."""
-        x = fenced(self.project)(iterate.x[0])
-        lower = fenced(self.attained)(x)
-        pull = residuals.dual[1] + 1
-        lost = fold(jnp.add, [_total(jnp.abs(d)) for d in residuals.dual[0]])
-        value = fold(jnp.add, [_total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
-        value = value + fold(jnp.add, iterate.y * self.rhs)
-        best = jnp.maximum(lower, record.lower)
-        # Where nothing is attained yet, the bound holds for lambda >= 0; a negative one excludes these, no more.
-        radius = 1 + self.radius * jnp.where(jnp.isinf(best), 0, jnp.maximum(0, -best))
-        scale = 1 / pull
-        upper = jnp.where(pull > 0, (value + radius * lost) * scale, jnp.inf)
-        rises, falls = lower > record.lower, upper < record.upper
-        return Record(
-            lower=best,
-            upper=jnp.where(falls, upper, record.upper),
-            x=tuple(jnp.where(rises, n, o) for n, o in zip(x, record.x, strict=True)),
-            y=jnp.where(falls, iterate.y * scale, record.y),
-            z=tuple(jnp.where(falls, n * scale, o) for n, o in zip(iterate.z, record.z, strict=True)),
-        )
-
-
-@dataclass(frozen=True)
-class EffortProblem(BlockProblem):
-    """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at.
-
-    Record: `upper` is attained by `x`, `lower` is certified by (y, z).
-
-    H is scaled so that its entries are 1 at most. Without lambda the blocks' bounds are |x|_inf <= 1.
-
-    guess: where to start, meeting E x = b about, well inside the rows if possible.
-    """
-
-    guess: Rows = ()
-    bordered = False
-
-    def start(self) -> Iterate:
-        """From the guess, with slacks of at least 0.03 and multipliers on the central path."""
-        blocks = self.project(self.guess)
-        s = tuple(
-            jnp.where(g.present > 0, jnp.maximum(g.h - _apply(g, x), 0.03), 1)
-            for g, x in zip(self.groups, blocks, strict=True)
-        )
-        z = tuple(0.02 * g.present / s_g for g, s_g in zip(self.groups, s, strict=True))
-        pull = tuple(self._gradient(g, x) + _adjoint(g, z_g) for g, x, z_g in zip(self.groups, blocks, z, strict=True))
-        return Iterate(blocks, -self.equality(pull), s, z)
-
-    def _gradient(self, g: Blocks, x: jax.Array) -> jax.Array:
-        half = fold(jnp.add, jnp.moveaxis(g.hessian * x, 1, 0))
-        return fold(jnp.add, g.hessian * half[:, None])
-
-    def residuals(self, iterate: Iterate) -> Residuals:
-        """Of stationarity, of E x = b and of the rows."""
-        blocks = iterate.x
-        dual = tuple(
-            self._gradient(g, x) + _adjoint(g, z) + e
-            for g, x, z, e in zip(self.groups, blocks, iterate.z, self.pull_back(iterate.y), strict=True)
-        )
-        rows = tuple(_apply(g, x) + s - g.h for g, x, s in zip(self.groups, blocks, iterate.s, strict=True))
-        return Residuals(dual, self.equality(blocks) - self.rhs, rows)
-
-    def solve(self, factors: _Factors, residuals: Residuals, shift: Rows) -> tuple:
-        """See `interior_point.Problem`."""
-
-        def improve(_: jax.Array, state: tuple) -> tuple:
-            dx, dy, rows = state
-            rhs = tuple(
-                -d - _adjoint(g, e + w * r) - self._gradient(g, x) - t
-                for g, d, e, w, r, x, t in zip(
-                    self.groups, residuals.dual, shift, factors.weights, rows, dx, self.pull_back(dy), strict=True
-                )
-            )
-            more_x, _, more_y = self._newton(factors, rhs, None, -residuals.primal - self.equality(dx))
-            dx = tuple(d + m for d, m in zip(dx, more_x, strict=True))
-            return dx, dy + more_y, tuple(_apply(g, d) for g, d in zip(self.groups, dx, strict=True))
-
-        zero = jax.tree.map(jnp.zeros_like, (residuals.dual, residuals.primal, residuals.rows))
-        return repeat(1 + self.refinements, improve, zero)
-
-    def first_record(self) -> Record:
-        """Nothing is known."""
-        inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
-        return Record(-inf, inf, tuple(jnp.zeros_like(x) for x in self.guess), *self.first_multipliers())
-
-    def gap_scale(self, record: Record) -> jax.Array:
-        """The effort, but not less than a thousandth of a unit."""
-        return jnp.maximum(jnp.where(jnp.isinf(record.upper), 0, record.upper), 1e-3)
-
-    def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
-        """Both bounds.
-
-        What a point misses the rows by is charged at the rows' multipliers, so that no effort is saved by it.
-        """
-        x = fenced(self.project)(iterate.x)
-
-        def value(x: Rows) -> jax.Array:
-            terms = [_total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
-            return 0.5 * fold(jnp.add, terms)
-
-        over = [jnp.maximum(_apply(g, x_g) - g.h, 0) for g, x_g in zip(self.groups, x, strict=True)]
-        missed = fold(jnp.maximum, [-_least(-o) for o in over])
-        charge = fold(jnp.add, [_total(o * z) for o, z in zip(over, iterate.z, strict=True)])
-        near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
-        upper = jnp.where(missed <= near, value(x) + charge, jnp.inf)
-        held = fold(jnp.add, [_total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
-        lost = fold(jnp.add, [_total(jnp.abs(d)) for d in residuals.dual])
-        lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - lost
-        falls, rises = upper < record.upper, lower > record.lower
-        return Record(
-            lower=jnp.where(rises, lower, record.lower),
-            upper=jnp.where(falls, upper, record.upper),
-            x=tuple(jnp.where(falls, n, o) for n, o in zip(x, record.x, strict=True)),
-            y=jnp.where(rises, iterate.y, record.y),
-            z=tuple(jnp.where(rises, n, o) for n, o in zip(iterate.z, record.z, strict=True)),
-        )

@@ -104,14 +104,12 @@ class Problem(Protocol):
 
 
 class Outcome(NamedTuple):
-    """What the loop leaves behind; per lane: steps taken, whether the gap closed, last complementarity mu."""
+    """What the loop leaves behind; `iterations` are the steps each lane took."""
 
     iterate: Iterate
     residuals: Residuals
     record: Any
     iterations: jax.Array
-    converged: jax.Array
-    mu: jax.Array
 
 
 class _Carry(NamedTuple):
@@ -184,15 +182,7 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         step=jnp.zeros((), jnp.int32),
     )
     last = lax.while_loop(unfinished, body, first)
-    gap = last.record.upper - last.record.lower
-    return Outcome(
-        iterate=last.iterate,
-        residuals=last.residuals,
-        record=last.record,
-        iterations=last.iterations,
-        converged=gap <= settings.tolerance * problem.gap_scale(last.record),
-        mu=last.mu,
-    )
+    return Outcome(last.iterate, last.residuals, last.record, last.iterations)
 
 
 def _predict_correct(

@@ -1,0 +1,118 @@
+"""min 1/2 sum x_i' H_i x_i over blocks, lambda held: the form of (22)."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from jaxgrasp.arrays import fold
+from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.solvers.block_kkt import (
+    BlockProblem,
+    Blocks,
+    Factors,
+    Record,
+    Rows,
+    adjoint_rows,
+    apply_rows,
+    least,
+    total,
+)
+from jaxgrasp.solvers.interior_point import Iterate, Residuals
+
+
+@dataclass(frozen=True)
+class EffortProblem(BlockProblem):
+    """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at.
+
+    Record: `upper` is attained by `x`, `lower` is certified by (y, z).
+
+    H is scaled so that its entries are 1 at most. Without lambda the blocks' bounds are |x|_inf <= 1.
+
+    guess: where to start, meeting E x = b about, well inside the rows if possible.
+    """
+
+    guess: Rows = ()
+    bordered = False
+
+    def start(self) -> Iterate:
+        """From the guess, with slacks of at least 0.03 and multipliers on the central path."""
+        blocks = self.project(self.guess)
+        s = tuple(
+            jnp.where(g.present > 0, jnp.maximum(g.h - apply_rows(g, x), 0.03), 1)
+            for g, x in zip(self.groups, blocks, strict=True)
+        )
+        z = tuple(0.02 * g.present / s_g for g, s_g in zip(self.groups, s, strict=True))
+        pull = tuple(
+            self._gradient(g, x) + adjoint_rows(g, z_g) for g, x, z_g in zip(self.groups, blocks, z, strict=True)
+        )
+        return Iterate(blocks, -self.equality(pull), s, z)
+
+    def _gradient(self, g: Blocks, x: jax.Array) -> jax.Array:
+        half = fold(jnp.add, jnp.moveaxis(g.hessian * x, 1, 0))
+        return fold(jnp.add, g.hessian * half[:, None])
+
+    def residuals(self, iterate: Iterate) -> Residuals:
+        """Of stationarity, of E x = b and of the rows."""
+        blocks = iterate.x
+        dual = tuple(
+            self._gradient(g, x) + adjoint_rows(g, z) + e
+            for g, x, z, e in zip(self.groups, blocks, iterate.z, self.pull_back(iterate.y), strict=True)
+        )
+        rows = tuple(apply_rows(g, x) + s - g.h for g, x, s in zip(self.groups, blocks, iterate.s, strict=True))
+        return Residuals(dual, self.equality(blocks) - self.rhs, rows)
+
+    def solve(self, factors: Factors, residuals: Residuals, shift: Rows) -> tuple:
+        """See `interior_point.Problem`."""
+
+        def improve(_: jax.Array, state: tuple) -> tuple:
+            dx, dy, rows = state
+            rhs = tuple(
+                -d - adjoint_rows(g, e + w * r) - self._gradient(g, x) - t
+                for g, d, e, w, r, x, t in zip(
+                    self.groups, residuals.dual, shift, factors.weights, rows, dx, self.pull_back(dy), strict=True
+                )
+            )
+            more_x, _, more_y = self._newton(factors, rhs, None, -residuals.primal - self.equality(dx))
+            dx = tuple(d + m for d, m in zip(dx, more_x, strict=True))
+            return dx, dy + more_y, tuple(apply_rows(g, d) for g, d in zip(self.groups, dx, strict=True))
+
+        zero = jax.tree.map(jnp.zeros_like, (residuals.dual, residuals.primal, residuals.rows))
+        return repeat(1 + self.refinements, improve, zero)
+
+    def first_record(self) -> Record:
+        """Nothing is known."""
+        inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
+        return Record(-inf, inf, tuple(jnp.zeros_like(x) for x in self.guess), *self.first_multipliers())
+
+    def gap_scale(self, record: Record) -> jax.Array:
+        """The effort, but not less than a thousandth of a unit."""
+        return jnp.maximum(jnp.where(jnp.isinf(record.upper), 0, record.upper), 1e-3)
+
+    def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
+        """Both bounds.
+
+        What a point misses the rows by is charged at the rows' multipliers, so that no effort is saved by it.
+        """
+        x = fenced(self.project)(iterate.x)
+
+        def value(x: Rows) -> jax.Array:
+            terms = [total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
+            return 0.5 * fold(jnp.add, terms)
+
+        over = [jnp.maximum(apply_rows(g, x_g) - g.h, 0) for g, x_g in zip(self.groups, x, strict=True)]
+        missed = fold(jnp.maximum, [-least(-o) for o in over])
+        charge = fold(jnp.add, [total(o * z) for o, z in zip(over, iterate.z, strict=True)])
+        near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
+        upper = jnp.where(missed <= near, value(x) + charge, jnp.inf)
+        held = fold(jnp.add, [total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
+        lost = fold(jnp.add, [total(jnp.abs(d)) for d in residuals.dual])
+        lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - lost
+        falls, rises = upper < record.upper, lower > record.lower
+        return Record(
+            lower=jnp.where(rises, lower, record.lower),
+            upper=jnp.where(falls, upper, record.upper),
+            x=tuple(jnp.where(falls, n, o) for n, o in zip(x, record.x, strict=True)),
+            y=jnp.where(rises, iterate.y, record.y),
+            z=tuple(jnp.where(rises, n, o) for n, o in zip(iterate.z, record.z, strict=True)),
+        )
