@@ -143,20 +143,6 @@ def test_shard_map_over_two_devices(batch, direct):
     assert_same(harness.as_numpy(sharded(*harness.data_of(batch))), direct)
 
 
-@pytest.fixture
-def compilations():
-    """How many programs were compiled so far, as a list that grows."""
-    seen = []
-
-    def listen(event: str, duration: float, **_) -> None:
-        if event.endswith("backend_compile_duration"):
-            seen.append(duration)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seen
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
 def test_other_data_are_not_compiled_again(batch, compilations):
     first = harness.data_of(batch[:7])
     largest(*first).margin.block_until_ready()

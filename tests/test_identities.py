@@ -57,18 +57,6 @@ def assert_same(batch: problems.Batch, ours: np.ndarray, other: np.ndarray) -> N
     assert np.all(np.abs(ours - other) <= SAME_MARGIN * unit_of(batch, ours, other))
 
 
-@pytest.mark.xdist_group("accuracy")
-@pytest.mark.parametrize("name", ["3 contacts", "4 contacts", "5 contacts", "8 contacts"])
-def test_keeping_the_directions_apart_changes_nothing(name):
-    group, reduced = problems.group(name), harness.margins(name)
-    unloaded = ~group.batch.required_wrench.any(axis=-1) & (group.batch.cone_margin == 0)
-    truth = harness.highs(name)
-    held = np.flatnonzero(((truth["margin"] > 1e-9 * truth["scale"]) | unloaded) & ~truth["by_definition"])[::37]
-    apart = oracles.largest_disturbances([group.batch.grasp(k, group.cone_edges) for k in held], every_direction=True)
-    margins, scale = np.array([a.margin for a in apart]), np.array([a.scale for a in apart])
-    assert np.all(np.abs(margins - reduced.margin[held]) <= SAME_MARGIN * np.maximum(scale, margins))
-
-
 def test_force_limits_and_loads_scale_the_margin(batch, plain):
     factor = np.geomspace(1e-3, 1e3, len(batch))
     scaled = replace(

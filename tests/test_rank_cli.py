@@ -18,8 +18,6 @@ from jaxgrasp.cli import rank as rank_command
 
 YCB = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "ycb_allegro_grasps.npz"
 
-pytestmark = pytest.mark.xdist_group("ranking")
-
 
 @pytest.fixture
 def here(tmp_path, monkeypatch) -> Path:

@@ -11,15 +11,13 @@ import pytest
 
 import jaxgrasp as jg
 from jaxgrasp.candidates import Candidates, concatenate, sample_grasps
-from jaxgrasp.ranking import RankingInterrupted, rank, ranking_table, tiles, write_table
+from jaxgrasp.ranking import RankingInterrupted, rank, ranking_table, write_table
 
 GRAVITY = 9.81
 # Every shape costs a compilation: tiles and tops of eight are shared by nearly all tests.
 COUNT, TILE, TOP = 24, 8, 8
 # The solver stops at a gap of 1e-8 of the margin's scale; tiles of other sizes may stop at other last digits.
 CLOSE = {"rtol": 1e-7, "atol": 1e-7}
-
-pytestmark = pytest.mark.xdist_group("ranking")
 
 
 @pytest.fixture(scope="module")
@@ -75,10 +73,11 @@ def test_one_large_tile_gives_the_same(grasps, ranking):
     np.testing.assert_allclose(other.margin, ranking.margin, **CLOSE)
 
 
-def test_one_compilation_for_all_tiles_and_calls(grasps, ranking):
-    before = tiles._solve_tile._cache_size()
+def test_one_compilation_for_all_tiles_and_calls(grasps, compilations):
     rank(grasps.take(slice(0, 20)), gravity=5.0, top=TOP, tile=TILE)  # 20 = 8 + 8 + 4
-    assert tiles._solve_tile._cache_size() == before
+    before = len(compilations)
+    rank(grasps.take(slice(0, 20)), gravity=4.0, top=TOP, tile=TILE)
+    assert len(compilations) == before
 
 
 def test_bad_candidates_come_last_and_harm_no_other(grasps, ranking):

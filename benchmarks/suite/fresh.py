@@ -58,10 +58,11 @@ def processes(*, everything: bool) -> list[dict]:
 
     first = "benchmarks.suite.first"
     add("imports and contacts only", 1, first, "nothing", "float32", "64")
-    add("first answer, jit, float32", 2 if everything else 1, first, "jit", "float32", "64")
-    add("first answer, direct call, float32", 1, first, "direct", "float32", "64")
+    runs = 2 if everything else 1
+    for dtype in ("float32", "float64"):
+        add(f"first answer, {dtype}", runs, first, "direct", dtype, "64")
+    add("first answer inside a user's jit, float32", runs, first, "jit", "float32", "64")
     if everything:
-        add("first answer, jit, float64", 2, first, "jit", "float64", "64")
         for dtype in ("float64", "float32"):
             add(f"jaxgrasp {dtype}, {LARGE_BATCH} programs", 1, first, "jit", dtype, str(LARGE_BATCH))
         for peer, distribution in peers.PEERS.items():

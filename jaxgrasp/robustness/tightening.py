@@ -25,7 +25,7 @@ _SETTINGS = {
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=False, safeguard=0.0, patience=8
     ),
     "float32": interior_point.Settings(
-        tolerance=3e-6, max_iterations=40, step_cap=1e-3, mu_floor=3e-8, equal_steps=True, safeguard=1e-3, patience=5
+        tolerance=5e-6, max_iterations=40, step_cap=1e-3, mu_floor=3e-8, equal_steps=True, safeguard=1e-3, patience=5
     ),
 }
 _EFFORT_SETTINGS = {
