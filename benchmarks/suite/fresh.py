@@ -54,7 +54,11 @@ def processes(*, everything: bool) -> list[dict]:
     def add(what: str, runs: int, *command: str) -> None:
         spent_by_each = [spent(["-m", *command]) for _ in range(runs)]
         seconds, peak = (min(each) for each in zip(*spent_by_each, strict=True))
+        tell(what, seconds, peak)
+
+    def tell(what: str, seconds: float, peak: float) -> None:
         rows.append({"what": what, "seconds": seconds, "peak_mib": peak})
+        say(f"  {what}: {seconds:.1f} s, {peak:.0f} MiB")
 
     first = "benchmarks.suite.first"
     add("imports and contacts only", 1, first, "nothing", "float32", "64")
@@ -69,10 +73,7 @@ def processes(*, everything: bool) -> list[dict]:
             # OSQP needs minutes for as many.
             if find_spec(distribution) and peer != "osqp":
                 add(f"{peer}, {MEMORY_BATCH} programs", 1, "benchmarks.suite.fresh", peer)
-        seconds, peak = million_candidates(CANDIDATES)
-        rows.append({"what": f"jaxgrasp rank, {CANDIDATES} candidates", "seconds": seconds, "peak_mib": peak})
-    for row in rows:
-        say(f"  {row['what']}: {row['seconds']:.1f} s, {row['peak_mib']:.0f} MiB")
+        tell(f"jaxgrasp rank, {CANDIDATES} candidates", *million_candidates(CANDIDATES))
     return rows
 
 
