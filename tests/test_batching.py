@@ -185,6 +185,15 @@ def test_vmap_costs_what_the_direct_batch_costs():
     assert best["mapped"] <= VMAP_COST * best["direct"], best
 
 
+def test_many_edges_in_more_than_one_tile():
+    """XLA's CPU backend refuses a tile whose operations it finds large."""
+    rng = np.random.default_rng(3)
+    normals = jnp.asarray(rng.normal(size=(100, 8, 3)), jnp.float32)
+    contacts = jg.Contacts.from_normals(normals, normals, friction=0.5, max_force=jnp.float32(1.0))
+    solution = jg.largest_disturbance(contacts, jg.DisturbanceSet.ball(1.0, 0.1), cone_edges=16)
+    assert np.mean(solution.status == jg.Status.SOLVED) > 0.95
+
+
 def test_the_compilers_options_do_not_stand_in_the_way():
     """JAX takes options for whole programs only; who nests a call, or differentiates it, need not know."""
     x = jnp.linspace(0.0, 1.0, 3)

@@ -144,7 +144,9 @@ def _run(stages: tuple, options: tuple, contacts: Contacts, disturbances: Distur
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
     compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
-    out = map_lanes((run, *stages[1:]), arguments, shared, n, compact=compact)
+    # The edges of the pyramid, if any; for fewer than eight, tiles are large enough.
+    edges = max([8, *options])
+    out = map_lanes((run, *stages[1:]), arguments, shared, n * (edges + 1), compact=compact)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 

@@ -17,16 +17,17 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxgrasp.fence import fences
 
 Tree = Any
-# Values of one row of a tile: its working set has to fit in the second-level cache.
-TILE = 256
+# Values of all rows of a tile: its working set has to fit in the second-level cache, and XLA's CPU backend would cut
+# larger operations in parallel tasks, which it cannot do inside a tile.
+TILE = 2304
 LOOSE_TILE = 1024
-# XLA's CPU backend cuts operations on more than half a megabyte in parallel tasks, which it cannot do inside a tile.
+# The same of what a tile is given: half a megabyte.
 LARGEST_LEAF = 1 << 15
 LARGE_TILE = 1 << 17
 
 
 def map_lanes(
-    stages: tuple[Callable[[Tree], Tree], ...], arguments: Tree, shared: Tree, blocks: int, *, compact: bool
+    stages: tuple[Callable[[Tree], Tree], ...], arguments: Tree, shared: Tree, rows: int, *, compact: bool
 ) -> Tree:
     """Run a kernel over the leading axis of its arguments.
 
@@ -37,7 +38,7 @@ def map_lanes(
         shared: like arguments, bool: the leaf is the same for all lanes.
         compact: the kernel is free of library calls and large reductions, so that a stage of a tile can be one function
             on CPUs.
-        blocks: how many blocks (contacts) a lane has, which sets the size of a tile.
+        rows: how many rows a lane has, which sets the size of a tile.
 
     Returns:
         What the last stage returns, leaves (lanes, ...).
@@ -50,13 +51,13 @@ def map_lanes(
         ]
         shapes = jax.eval_shape(_run(stages, structure, tuple(jax.tree.leaves(shared)), 0), one)
         return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), shapes)
-    return _run(stages, structure, tuple(jax.tree.leaves(shared)), blocks if compact else 0)(leaves)
+    return _run(stages, structure, tuple(jax.tree.leaves(shared)), rows if compact else 0)(leaves)
 
 
-def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], blocks: int) -> Callable:
+def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int) -> Callable:
     @custom_vmap
     def run(leaves: list[jax.Array]) -> Tree:
-        return _tiled(stages, structure, shared, blocks, leaves)
+        return _tiled(stages, structure, shared, rows, leaves)
 
     @run.def_vmap
     def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
@@ -73,7 +74,7 @@ def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...],
             elif not is_batched:
                 leaf = jnp.broadcast_to(leaf[None], (size, *leaf.shape))
             merged.append(leaf.reshape(size * lanes, *leaf.shape[2:]))
-        out = _run(stages, structure, tuple(still_shared), blocks)(merged)
+        out = _run(stages, structure, tuple(still_shared), rows)(merged)
         out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
@@ -81,7 +82,7 @@ def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...],
 
 
 def _tiled(
-    stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], blocks: int, leaves: list[jax.Array]
+    stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int, leaves: list[jax.Array]
 ) -> Tree:
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
 
@@ -116,10 +117,10 @@ def _tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
-        size = min(1 << max(0, (TILE // max(blocks, 1)).bit_length() - 1), 64)
+        size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
         largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
-        compact = blocks > 0 and lanes > size and largest <= LARGEST_LEAF
-        size = size if blocks and largest <= LARGEST_LEAF else LOOSE_TILE
+        compact = rows > 0 and lanes > size and largest <= LARGEST_LEAF
+        size = size if rows and largest <= LARGEST_LEAF else LOOSE_TILE
 
         def one(parts: list[jax.Array]) -> Tree:
             with fences(True):
