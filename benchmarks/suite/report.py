@@ -30,9 +30,9 @@ of these programs infeasible; OSQP stops after 20,000 iterations. `solved` is wh
 against HiGHS at 1e-10, relative to max(Lambda, |lambda|), and `right` is the share within 1e-6. Times are the best of
 several rounds, all jobs of a table by turns, warm, compilation apart (two programs at a time but for the first
 table); rounds that took 15 % longer than the best count as noisy. `cpu/wall` is the processor time a second: two
-where both cores worked. Fresh processes come first, while nothing else runs; `direct call` is `largest_disturbance`
-without `jax.jit` around it. The peak for S_1 and S_2 is what a large matrix product of NumPy reaches by turns with
-them.
+where both cores worked. Fresh processes come first, while nothing else runs; the first answer is that of
+`largest_disturbance` for 64 grasps. A solver whose version is not listed was not installed. The peak for S_1 and S_2 is
+what a large matrix product of NumPy reaches by turns with them.
 """
 
 
