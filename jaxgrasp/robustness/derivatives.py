@@ -195,7 +195,8 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     if move_lambda is not None:
         reach = reach - z * (move_lambda * program.scale)
     force, move = jnp.moveaxis(forces, 1, 0), move_x * scales
-    y, move_y = (program.wrench_multipliers(v, jnp.ones_like(grasps.units)) for v in (iterate.y, move_y))
+    y = jnp.where(point.usable, point.wrench_multipliers, 0) / grasps.units / unit
+    move_y = program.wrench_multipliers(move_y, jnp.ones_like(grasps.units))
     normal = literal(pyramid_facets(cone_edges)[:, 2], z.dtype)[:, None, None]
     asked = None
     if grasps.margin is not None:
