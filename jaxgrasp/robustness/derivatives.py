@@ -26,11 +26,12 @@ from jaxgrasp.robustness.program import Program, scaled_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
 from jaxgrasp.solvers.block_kkt import BlockProblem, adjoint_rows, apply_rows, total
 from jaxgrasp.solvers.interior_point import Iterate
-from jaxgrasp.solvers.sensitivity import central_point, change_of_rows, solve_symmetric
+from jaxgrasp.solvers.sensitivity import central_point, solve_symmetric
 
-# kappa, relative to the margin's natural scale, of the central points whose derivatives stand for those of the exact
-# forces, and the largest residual with which they count as found.
-_KAPPA = {"float64": 1e-8, "float32": 1e-5}
+# kappa of the central points whose derivatives stand for those of the exact forces of (21) and of (22), in the solver's
+# units, and the largest residual with which they count as found. Of (21) many forces may be optimal, and what tells
+# them apart has a share of kappa^2: below 1e-6 rounding is felt.
+_KAPPA = {"float64": (1e-6, 1e-8), "float32": (1e-4, 1e-5)}
 _FOUND = {"float64": 1e-9, "float32": 1e-4}
 
 
@@ -169,26 +170,21 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
         pull = pull + ct.effort * weighed
         effort_weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
     right_x = jnp.moveaxis(pull, 1, 0) * scales * grasps.present
-    right_lambda, right_y, row_pull = jnp.zeros_like(unit), jnp.zeros_like(problem.rhs), jnp.zeros_like(z)
+    right_z = jnp.zeros_like(z)
     if ct.cone_multipliers is not None:
-        row_pull = row_pull.at[:-1].add(jnp.moveaxis(ct.cone_multipliers, 1, 0))
+        right_z = right_z.at[:-1].add(jnp.moveaxis(ct.cone_multipliers, 1, 0))
     if ct.bound_multipliers is not None:
-        row_pull = row_pull.at[-1].add(ct.bound_multipliers)
-    weights = z / s * program.present
-    row_pull = weights * row_pull * unit / row_units
+        right_z = right_z.at[-1].add(ct.bound_multipliers)
+    right_y, right_lambda = jnp.zeros_like(problem.rhs), None
     if ct.wrench_multipliers is not None:
         right_y = program.wrench_multipliers_adjoint(ct.wrench_multipliers, grasps.units) * unit
-    right_x = right_x + adjoint_rows(group, row_pull)
     if problem.bordered:
-        right_lambda = total(group.sigma * row_pull)
-        if ct.margin is not None:
-            right_lambda = right_lambda + ct.margin * program.scale
-    right = ((right_x,), right_lambda if problem.bordered else None, right_y)
-    (move_x,), move_lambda, move_y = solve_symmetric(problem, (weights,), right)
+        right_lambda = jnp.zeros_like(unit) if ct.margin is None else ct.margin * program.scale
+    right = ((right_x,), right_lambda, right_y, (right_z * unit / row_units * grasps.present,))
+    (move_x,), move_lambda, move_y, (values,) = solve_symmetric(problem, (s,), (z,), right)
 
     # Back in newtons: forces, margin, and multipliers for an objective in the solver's unit.
-    (change,) = change_of_rows(problem, (move_x,), move_lambda)
-    values = (row_pull - weights * change) / row_units
+    values = -values * grasps.present / row_units
     z = z / row_units
     margin = jnp.where(point.usable, point.margin, 0)
     reach = values * margin
@@ -223,7 +219,7 @@ def central_kappa(grasps: Grasps, program: Program, unit: jax.Array) -> jax.Arra
     """What s z is at the central point, scaled, (*lanes), for an objective in the given unit."""
     if grasps.smoothing is not None:
         return grasps.smoothing / unit
-    return jnp.full_like(program.scale, _KAPPA[program.scale.dtype.name])
+    return jnp.full_like(program.scale, _KAPPA[program.scale.dtype.name][grasps.margin is not None])
 
 
 def centred(grasps: Grasps, program: Program, start: Iterate, active: jax.Array) -> Point:

@@ -169,6 +169,11 @@ class _Tightening:
     def _solve(self, grasps: Grasps, program: Program) -> Solution:
         raise NotImplementedError
 
+    def _point(self, out: Solution, usable: jax.Array) -> Point:
+        if self.smooth:
+            usable &= out.status != Status.MAX_ITERATIONS
+        return Point(usable=usable, **{name: getattr(out, name) for name in Point._fields if name != "usable"})
+
     def _central(self, along: Along, point: Point) -> Point:
         """The derivative of everything at the central point, which is the point itself where smoothing is asked for."""
         kernel = CentralPoint(self.cone_edges)
@@ -180,7 +185,7 @@ class _LargestDisturbance(_Tightening):
         return _solve_margin(grasps, program)[0]
 
     def tangents(self, along: Along, out: Solution) -> Solution:
-        point = _point_of(out, jnp.isfinite(out.margin))
+        point = self._point(out, jnp.isfinite(out.margin))
         change = self._central(along, point)
         if not self.smooth:
             adjoint = partial(envelope_adjoint, self.cone_edges)
@@ -193,11 +198,7 @@ class _LeastEffort(_Tightening):
         return _solve_effort(grasps, program, *_solve_margin(replace(grasps, smoothing=None), program))
 
     def tangents(self, along: Along, out: Solution) -> Solution:
-        return _changed(out, self._central(along, _point_of(out, jnp.isfinite(out.effort))))
-
-
-def _point_of(solution: Solution, usable: jax.Array) -> Point:
-    return Point(usable=usable, **{name: getattr(solution, name) for name in Point._fields if name != "usable"})
+        return _changed(out, self._central(along, self._point(out, jnp.isfinite(out.effort))))
 
 
 def _changed(out: Solution, change: Point) -> Solution:
@@ -210,7 +211,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     """(21) for lanes; also the scaled record, from which (22) starts."""
     dtype = program.rhs.dtype
     problem = margin_problem(program)
-    settings, slack = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
+    settings = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     # Without a load, no forces at all are an answer with margin 0, exactly.
     idle = (outcome.record.lower < 0) & (program.rhs == 0).all(0) & (grasps.reserve == 0)
@@ -220,7 +221,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     )
     low, high = record.lower, record.upper
     size = jnp.maximum(1, jnp.abs(low))
-    closed = high - low <= _ACCEPTED_GAP[dtype.name] * jnp.where(jnp.isinf(low), 1, size) + slack
+    closed = high - low <= _ACCEPTED_GAP[dtype.name] * jnp.where(jnp.isinf(low), 1, size)
     bearable = low >= -settings.tolerance
 
     margin, upper = low * program.scale, high * program.scale
@@ -265,27 +266,30 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     )
     if grasps.smoothing is None:
         return solution, record
-    return _at_centre(grasps, program, outcome.iterate, solution), record
+    possible = ~(program.wrench_outside | program.disturbance_outside | program.undisturbed)
+    return _at_centre(grasps, program, outcome.iterate, solution, grasps.valid & possible), record
 
 
-def _towards_centre(
-    settings: Settings, grasps: Grasps, program: Program, unit: jax.Array
-) -> tuple[Settings, jax.Array | float]:
+def _towards_centre(settings: Settings, grasps: Grasps, program: Program, unit: jax.Array) -> Settings:
     """Where smoothing is asked for, the loop aims at the central point, whose gap is kappa for every row."""
     if grasps.smoothing is None:
-        return settings, 0.0
+        return settings
     kappa = central_kappa(grasps, program, unit)
-    gap = 2 * kappa * program.sigma.shape[0] * fold(jnp.add, grasps.present)
-    return settings._replace(tolerance=jnp.maximum(settings.tolerance, gap), mu_floor=kappa), gap
+    gap = kappa * program.sigma.shape[0] * fold(jnp.add, grasps.present)
+    return settings._replace(gap_floor=1.5 * gap, mu_floor=kappa)
 
 
-def _at_centre(grasps: Grasps, program: Program, iterate: Iterate, solution: Solution) -> Solution:
-    """The solution with the central point in place of the best one."""
-    point = centred(grasps, program, iterate, jnp.isfinite(solution.effort) & jnp.isfinite(solution.margin))
-    failed = (solution.status == Status.SOLVED) & ~point.usable
-    values = {name: getattr(point, name) for name in Point._fields if name != "usable"}
-    kept = {name: jnp.where(point.usable, value, getattr(solution, name)) for name, value in values.items()}
-    return replace(solution, **kept, status=jnp.where(failed, Status.MAX_ITERATIONS, solution.status))
+def _at_centre(grasps: Grasps, program: Program, iterate: Iterate, solution: Solution, possible: jax.Array) -> Solution:
+    """The solution with the central point in place of the best one; solved where that is found."""
+    point = centred(grasps, program, iterate, possible)
+    margin = jnp.where(program.slippery, jnp.minimum(point.margin, 0), point.margin)
+    values = point._replace(margin=margin)._asdict()
+    found = values.pop("usable")
+    kept = {name: jnp.where(found, value, getattr(solution, name)) for name, value in values.items()}
+    proven = solution.status == Status.INFEASIBLE
+    status = jnp.where(found & ~proven, Status.SOLVED, solution.status)
+    status = jnp.where(possible & ~found & ~proven, Status.MAX_ITERATIONS, status)
+    return replace(solution, **kept, status=status)
 
 
 def _largest(rows: tuple) -> jax.Array:
@@ -296,7 +300,7 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     """(22) for lanes, from what (21) left."""
     dtype, blocks = program.rhs.dtype, program.blocks
     problem, wanted, unit = effort_problem(grasps, program)
-    settings, slack = _towards_centre(_EFFORT_SETTINGS[dtype.name], grasps, program, unit**2)
+    settings = _towards_centre(_EFFORT_SETTINGS[dtype.name], grasps, program, unit**2)
     reachable = grasps.margin <= first.upper_bound * (1 + settings.tolerance)
     held = (reachable & jnp.isfinite(record.lower)) | program.undisturbed
 
@@ -314,7 +318,7 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     outcome = interior_point.solve(problem, settings, active & ~idle)
     best = jax.tree.map(lambda x: jnp.where(idle, 0, x), outcome.record)
     gap = (best.upper - best.lower) / problem.gap_scale(best)
-    closed = gap <= _ACCEPTED_GAP[dtype.name] + slack / problem.gap_scale(best)
+    closed = gap <= _ACCEPTED_GAP[dtype.name]
 
     status = jnp.select(
         [~grasps.valid, ~active, closed, program.doubtful],
@@ -345,4 +349,4 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     )
     if grasps.smoothing is None:
         return solution
-    return _at_centre(grasps, program, outcome.iterate, solution)
+    return _at_centre(grasps, program, outcome.iterate, solution, active & ~idle)

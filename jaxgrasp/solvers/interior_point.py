@@ -33,15 +33,17 @@ class Settings(NamedTuple):
     equal_steps: one step length for primal and dual unknowns (static).
     safeguard: keep s >= safeguard * mu / z and z >= safeguard * mu / s after a step (static; 0.0 switches it off).
     patience: steps in a row that may fail to cut the gap by a tenth.
+    gap_floor: gaps up to this one count as closed, whatever their scale; the loop then ends near a central point.
     """
 
-    tolerance: float
+    tolerance: float | jax.Array
     max_iterations: int
     step_cap: float
-    mu_floor: float
+    mu_floor: float | jax.Array
     equal_steps: bool
     safeguard: float
     patience: int = 3
+    gap_floor: float | jax.Array = 0.0
 
 
 class Iterate(NamedTuple):
@@ -157,7 +159,7 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         improved = gap < 0.9 * carry.best_gap
         # Until both bounds exist there is no gap to stall.
         stalled = jnp.where(improved | jnp.isinf(gap), 0, carry.stalled + 1)
-        closed = gap <= settings.tolerance * problem.gap_scale(record)
+        closed = gap <= jnp.maximum(settings.tolerance * problem.gap_scale(record), settings.gap_floor)
         return _Carry(
             iterate=iterate,
             residuals=residuals,
