@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -129,12 +130,92 @@ def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array
     matrices = jnp.moveaxis(compliance, axes, (-2, -1))
     skew = jnp.abs(matrices - jnp.swapaxes(matrices, -1, -2)).max((-2, -1))
     symmetric = skew <= 1e-5 * jnp.abs(matrices).max((-2, -1))
+    half, positive = _inverse_root(matrices)
+    sound = symmetric & positive
+    half = jnp.where(sound[..., None, None], half, jnp.eye(half.shape[-1], dtype=half.dtype))
+    return jnp.moveaxis(half, (-2, -1), axes), sound if full else sound.all(0)
+
+
+@jax.custom_jvp
+def _inverse_root(matrices: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """M with M M' = Q^-1 for Q (..., k, k), and whether Q is positive definite; the identity where it is not."""
     lower = jnp.linalg.cholesky(matrices, symmetrize_input=True)
-    sound = symmetric & jnp.isfinite(lower).all((-2, -1))
+    sound = jnp.isfinite(lower).all((-2, -1))
     eye = jnp.broadcast_to(jnp.eye(matrices.shape[-1], dtype=matrices.dtype), matrices.shape)
     lower = jnp.where(sound[..., None, None], lower, eye)
-    half = jnp.swapaxes(jax.scipy.linalg.solve_triangular(lower, eye, lower=True), -1, -2)
-    return jnp.moveaxis(half, (-2, -1), axes), sound if full else sound.all(0)
+    return jnp.swapaxes(jax.scipy.linalg.solve_triangular(lower, eye, lower=True), -1, -2), sound
+
+
+@_inverse_root.defjvp
+def _inverse_root_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """DM = -1/2 M M' dQ M: then d(M M') = -Q^-1 dQ Q^-1, and only M M' matters."""
+    (change,) = tangents
+    half, sound = _inverse_root(*primals)
+    change = jnp.where(sound[..., None, None], change + jnp.swapaxes(change, -1, -2), 0)
+    moved = -0.25 * half @ (jnp.swapaxes(half, -1, -2) @ change @ half)
+    return (half, sound), (moved, np.zeros(sound.shape, jax.dtypes.float0))
+
+
+@jax.custom_jvp
+def whitened(rows: jax.Array) -> Basis:
+    """`row_basis` as a change of coordinates: in its derivative the row operations and the rank stay as they are.
+
+    That is all that programs need whose rows are whitened: their solutions do not depend on which combinations are
+    taken.
+    """
+    return row_basis(rows)
+
+
+@whitened.defjvp
+def _whitened_jvp(primals: tuple, tangents: tuple) -> tuple[Basis, Basis]:
+    basis, (change,) = whitened(*primals), tangents
+    still = jax.tree.map(jnp.zeros_like, basis)
+    return basis, still._replace(rows=_operate(basis, change))
+
+
+@fenced
+def _operate(basis: Basis, rows: jax.Array) -> jax.Array:
+    """T rows, zero where dropped."""
+    combine = lambda t: fold(jnp.add, [t_r * r for t_r, r in zip(t[0], rows, strict=True)]) * t[1]  # noqa: E731
+    return each(combine, (basis.operations, basis.kept))
+
+
+@jax.custom_jvp
+def _inverse(rows: jax.Array) -> tuple[jax.Array, Basis]:
+    """N^+ (3, 6, n, *lanes) of N (6, 3, n, *lanes), and the basis B = T N of its rows."""
+    basis = row_basis(rows)
+
+    @fenced
+    def assemble(rows: jax.Array, operations: jax.Array) -> jax.Array:
+        # On dropped rows the basis is zero, so what T holds there does not matter.
+        column = lambda t: fold(jnp.add, [r * t_r for r, t_r in zip(rows, t, strict=True)])  # noqa: E731
+        return jnp.moveaxis(each(column, jnp.moveaxis(operations, 1, 0)), 0, 1)
+
+    return assemble(basis.rows, basis.operations), basis
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """While the rank stays: dN^+ = V - N^+ (N V + dN N^+) with V = dN' K and K = N^+' N^+ = (N N')^+."""
+    (rows,), (change,) = primals, tangents
+    inverse, basis = _inverse(rows)
+
+    @fenced
+    def turn(rows: jax.Array, change: jax.Array, inverse: jax.Array) -> tuple[jax.Array, jax.Array]:
+        columns = jnp.swapaxes(inverse, 0, 1)
+        gram = each(lambda column: _dot(columns, column), columns)
+        turned = each(lambda k: fold(jnp.add, [c * k_r for c, k_r in zip(change, k, strict=True)]), gram)
+        both = each(lambda pair: _dot(rows, pair[0]) + _dot(change, pair[1]), (turned, columns))
+        return turned, both
+
+    @fenced
+    def assemble(inverse: jax.Array, turned: jax.Array, both: jax.Array) -> jax.Array:
+        columns = jnp.swapaxes(inverse, 0, 1)
+        column = lambda v: v[0] - fold(jnp.add, [c * b for c, b in zip(columns, v[1], strict=True)])  # noqa: E731
+        return jnp.swapaxes(each(column, (turned, both)), 0, 1)
+
+    still = jax.tree.map(jnp.zeros_like, basis)
+    return (inverse, basis), (assemble(inverse, *turn(rows, change, inverse)), still)
 
 
 def pseudo_inverse(columns: jax.Array, half: jax.Array | None) -> tuple[jax.Array, Basis]:
@@ -147,16 +228,55 @@ def pseudo_inverse(columns: jax.Array, half: jax.Array | None) -> tuple[jax.Arra
     Returns:
         (3, 6, n, *lanes), blocks of G*, and the basis of the rows of G.
     """
-    basis = row_basis(_times_half(columns, half))
-    rows = _half_times(basis.rows, half)
+    inverse, basis = _inverse(_times_half(columns, half))
+    if half is None:
+        return inverse, basis
+    return jnp.swapaxes(_half_times(jnp.swapaxes(inverse, 0, 1), half), 0, 1), basis
+
+
+def pseudo_inverse_adjoint(
+    columns: jax.Array, half: jax.Array | None, pulled: jax.Array
+) -> tuple[jax.Array, jax.Array | None]:
+    """The transpose of the derivative of G*, while the rank stays.
+
+    With G* = M N^+, N = G M, and the cotangent P of N^+: that of N is K (P' - X'N) - X N^+' with X = N^+'P and
+    K = N^+'N^+.
+
+    Args:
+        columns: (6, 3, n, *lanes).
+        half: M, see `inverse_root`.
+        pulled: (6, 3, n, *lanes), cotangents of the blocks of G*.
+
+    Returns:
+        Cotangents of columns and of M.
+    """
+    rows = columns if half is None else _times_half(columns, half)
+    inverse = jnp.swapaxes(_inverse(rows)[0], 0, 1)
+    own = pulled if half is None else _half_times(pulled, _swapped(half, columns.shape[2]))
 
     @fenced
-    def assemble(rows: jax.Array, operations: jax.Array) -> jax.Array:
-        # On dropped rows the basis is zero, so what T holds there does not matter.
-        column = lambda t: fold(jnp.add, [r * t_r for r, t_r in zip(rows, t, strict=True)])  # noqa: E731
-        return jnp.moveaxis(each(column, jnp.moveaxis(operations, 1, 0)), 0, 1)
+    def products(inverse: jax.Array, own: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return each(lambda i: (_dot(own, i), _dot(inverse, i)), inverse)
 
-    return assemble(rows, basis.operations), basis
+    @fenced
+    def combine(cross: jax.Array, gram: jax.Array, rows: jax.Array, inverse: jax.Array, own: jax.Array) -> jax.Array:
+        left = jnp.swapaxes(cross, 0, 1)
+        rest = own - each(lambda x: fold(jnp.add, [r * x_r for r, x_r in zip(rows, x, strict=True)]), left)
+        pair = lambda k: fold(  # noqa: E731
+            jnp.add, [v * k_r - i * x_r for v, i, k_r, x_r in zip(rest, inverse, *k, strict=True)]
+        )
+        return each(pair, (gram, cross))
+
+    back = combine(*products(inverse, own), rows, inverse, own)
+    if half is None:
+        return back, None
+    pull = jax.vjp(lambda columns, half: (_times_half(columns, half), _half_times(inverse, half)), columns, half)[1]
+    return pull((back, pulled))
+
+
+def _swapped(half: jax.Array, contacts: int) -> jax.Array:
+    """M'."""
+    return jnp.swapaxes(half, 0, 1) if half.shape[:2] == (3 * contacts,) * 2 else jnp.swapaxes(half, 1, 2)
 
 
 def _times_half(columns: jax.Array, half: jax.Array | None) -> jax.Array:
@@ -169,10 +289,8 @@ def _times_half(columns: jax.Array, half: jax.Array | None) -> jax.Array:
     return _unflatten(tall)
 
 
-def _half_times(rows: jax.Array, half: jax.Array | None) -> jax.Array:
-    """M q for every basis row q, (6, 3, n, *lanes)."""
-    if half is None:
-        return rows
+def _half_times(rows: jax.Array, half: jax.Array) -> jax.Array:
+    """M q for every row q, (6, 3, n, *lanes)."""
     if half.shape[:2] != (3 * rows.shape[2],) * 2:
         return jnp.einsum("nac...,rcn...->ran...", half, rows)
     return _unflatten(jnp.einsum("pq...,rq...->rp...", half, _flatten(rows)))

@@ -139,3 +139,11 @@ def support(terms: tuple[Term, ...], directions: jax.Array) -> jax.Array:
     for term in terms:
         total = total + term.support(directions)
     return total
+
+
+def furthest(terms: tuple[Term, ...], directions: jax.Array) -> jax.Array:
+    """The wrench of a sum of sets that reaches furthest along a, the gradient of `support`, (6, ..., *lanes)."""
+    total = jnp.zeros_like(directions)
+    for term in terms:
+        total = total + term.furthest(directions)
+    return total

@@ -5,16 +5,21 @@ of size 1 where shared.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, Self
+from functools import partial
+from typing import Any, Protocol, Self
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import safe_norm
+from jaxgrasp.arrays import fold, safe_divide, safe_norm
 from jaxgrasp.fence import fenced
+
+Tree = Any
 
 
 class Term(Protocol):
@@ -35,6 +40,10 @@ class Term(Protocol):
 
     def support(self, directions: jax.Array) -> jax.Array:
         """max(0, max over the set of a'w) for directions a (6, ..., *lanes)."""
+        ...
+
+    def furthest(self, directions: jax.Array) -> jax.Array:
+        """The wrench of the set that reaches furthest along a, the gradient of `support`, (6, ..., *lanes)."""
         ...
 
     def extent(self) -> jax.Array:
@@ -99,30 +108,76 @@ class Vertices:
         """A running maximum over the vertices, a few at a time: memory does not grow with their number."""
         if directions.ndim > self.wrenches.ndim:
             return lax.map(self.support, jnp.moveaxis(directions, 1, 0))
-        count, wrenches = self.wrenches.shape[0], self.wrenches
-        chunk = min(count, _chunk(directions[0], wrenches.shape[2:]))
+        return _most(self.wrenches, directions)
 
-        def raise_to(best: jax.Array, some: jax.Array) -> jax.Array:
-            for j in range(some.shape[0]):
-                best = jnp.maximum(best, _combine(some[j], directions))
-            return best
-
-        best = jnp.zeros_like(directions[0])
-        if count == 0:
-            return best
-        chunks = -(-count // chunk)
-        padded = jnp.pad(wrenches, [(0, chunks * chunk - count)] + [(0, 0)] * (wrenches.ndim - 1))
-        if chunks == 1:
-            return fenced(raise_to)(best, padded)
-
-        def body(i: jax.Array, best: jax.Array) -> jax.Array:
-            return raise_to(best, lax.dynamic_slice_in_dim(padded, i * chunk, chunk))
-
-        return lax.fori_loop(0, chunks, body, best)
+    def furthest(self, directions: jax.Array) -> jax.Array:
+        """A vertex, or the origin."""
+        if directions.ndim > self.wrenches.ndim:
+            return jnp.moveaxis(lax.map(self.furthest, jnp.moveaxis(directions, 1, 0)), 0, 1)
+        return jnp.stack(_furthest(self.wrenches, directions)[1])
 
     def extent(self) -> jax.Array:
         """Componentwise maximum."""
         return jnp.max(jnp.abs(self.wrenches), -2, initial=0)
+
+
+def _over_vertices(wrenches: jax.Array, row: jax.Array, raise_to: Callable, best: Tree) -> Tree:
+    """Fold `raise_to(best, some vertices)` over the vertices (directions, 6, *lanes), padded with the origin."""
+    count = wrenches.shape[0]
+    if count == 0:
+        return best
+    chunk = min(count, _chunk(row, wrenches.shape[2:]))
+    chunks = -(-count // chunk)
+    padded = jnp.pad(wrenches, [(0, chunks * chunk - count)] + [(0, 0)] * (wrenches.ndim - 1))
+    if chunks == 1:
+        return fenced(raise_to)(best, padded)
+
+    def body(i: jax.Array, best: Tree) -> Tree:
+        return raise_to(best, lax.dynamic_slice_in_dim(padded, i * chunk, chunk))
+
+    return lax.fori_loop(0, chunks, body, best)
+
+
+@jax.custom_jvp
+def _most(wrenches: jax.Array, directions: jax.Array) -> jax.Array:
+    """max(0, max_j a'w_j) for vertices (directions, 6, *lanes) and a (6, rows, *lanes)."""
+
+    def raise_to(best: jax.Array, some: jax.Array) -> jax.Array:
+        for each_wrench in some:
+            best = jnp.maximum(best, _combine(each_wrench, directions))
+        return best
+
+    return _over_vertices(wrenches, directions[0], raise_to, jnp.zeros_like(directions[0]))
+
+
+@partial(_most.defjvp, symbolic_zeros=True)
+def _most_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """With w the vertex that a reaches furthest along: da'w + a'dw."""
+    (wrenches, directions), (moved, turned) = primals, tangents
+    still = isinstance(moved, SymbolicZero)
+    reach, worst = _furthest(wrenches if still else jnp.concatenate([wrenches, moved], 1), directions)
+    change = jnp.zeros_like(reach)
+    if not isinstance(turned, SymbolicZero):
+        change = change + fold(jnp.add, [w * a for w, a in zip(worst[:6], turned, strict=True)])
+    if not still:
+        change = change + fold(jnp.add, [w * a for w, a in zip(worst[6:], directions, strict=True)])
+    return reach, change
+
+
+def _furthest(wrenches: jax.Array, directions: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    """How far the vertices reach, and the one that does, whose components may be more than six."""
+
+    def raise_to(best: tuple, some: jax.Array) -> tuple:
+        for each_wrench in some:
+            reach, worst = best
+            own = _combine(each_wrench[:6], directions)
+            further = own > reach
+            pairs = zip(each_wrench, worst, strict=True)
+            best = jnp.where(further, own, reach), tuple(jnp.where(further, _align(w, own), o) for w, o in pairs)
+        return best
+
+    none = jnp.zeros_like(directions[0])
+    return _over_vertices(wrenches, none, raise_to, (none, (none,) * wrenches.shape[1]))
 
 
 @jax.tree_util.register_dataclass
@@ -150,14 +205,31 @@ class Box:
 
     def support(self, directions: jax.Array) -> jax.Array:
         """Sum of |a_i| r_i, a in the box's frame."""
-        if self.axes is not None:
-            columns = [
-                sum(_align(self.axes[r, c], directions[0]) * directions[half + r] for r in range(3))
-                for half in (0, 3)
-                for c in range(3)
-            ]
-            directions = jnp.stack(columns)
-        return _combine(self.half_extents, jnp.abs(directions))
+        return _combine(self.half_extents, jnp.abs(self._turned(directions)))
+
+    def furthest(self, directions: jax.Array) -> jax.Array:
+        """A corner, or the middle of a face."""
+        signs = jnp.sign(self._turned(directions))
+        corner = [_align(r, s) * s for r, s in zip(self.half_extents, signs, strict=True)]
+        if self.axes is None:
+            return jnp.stack(corner)
+        axes = self.axes
+        back = [
+            sum(_align(axes[r, c], corner[0]) * corner[half + c] for c in range(3)) for half in (0, 3) for r in range(3)
+        ]
+        return jnp.stack(back)
+
+    def _turned(self, directions: jax.Array) -> jax.Array:
+        """Directions in the box's frame."""
+        axes = self.axes
+        if axes is None:
+            return directions
+        columns = [
+            sum(_align(axes[r, c], directions[0]) * directions[half + r] for r in range(3))
+            for half in (0, 3)
+            for c in range(3)
+        ]
+        return jnp.stack(columns)
 
     def extent(self) -> jax.Array:
         """Half extents, turned; negative ones stay negative."""
@@ -192,7 +264,17 @@ class Ellipsoid:
 
     def support(self, directions: jax.Array) -> jax.Array:
         """|L'a|."""
-        return safe_norm(jnp.stack([_combine(self.shape_matrix[:, c], directions) for c in range(6)]), 0)
+        return safe_norm(self._pulled(directions), 0)
+
+    def furthest(self, directions: jax.Array) -> jax.Array:
+        """L L'a / |L'a|."""
+        pulled = self._pulled(directions)
+        unit = safe_divide(pulled, safe_norm(pulled, 0))
+        return jnp.stack([_combine(self.shape_matrix[r], unit) for r in range(6)])
+
+    def _pulled(self, directions: jax.Array) -> jax.Array:
+        """L'a."""
+        return jnp.stack([_combine(self.shape_matrix[:, c], directions) for c in range(6)])
 
     def extent(self) -> jax.Array:
         """Row norms; not the safe norm, which hides NaN."""
@@ -225,6 +307,11 @@ class Ball:
         return _align(self.force, directions[0]) * safe_norm(directions[:3], 0) + _align(
             self.torque, directions[0]
         ) * safe_norm(directions[3:], 0)
+
+    def furthest(self, directions: jax.Array) -> jax.Array:
+        """Radii times unit vectors."""
+        force, torque = (safe_divide(half, safe_norm(half, 0)) for half in (directions[:3], directions[3:]))
+        return jnp.concatenate([_align(self.force, force) * force, _align(self.torque, torque) * torque])
 
     def extent(self) -> jax.Array:
         """Radii."""

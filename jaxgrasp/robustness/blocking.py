@@ -1,5 +1,7 @@
 """Blocking forces: how the fingers answer while a disturbance acts, (14)-(15)."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -9,6 +11,7 @@ from jaxgrasp.contact.compliance import Compliance, pseudo_inverse
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.kernels import Plain
 
 
 def blocking_forces(
@@ -30,16 +33,20 @@ def blocking_forces(
     Raises:
         ValueError: shapes that do not fit.
     """
-    return over_grasps((_blocking_kernel,), contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
+    return over_grasps(_BlockingForces(), contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
 
 
-def _blocking_kernel(grasps: Grasps) -> jax.Array:
-    scaled = grasps.terms[0].wrenches * grasps.units
-    if grasps.vertex_halves is None:
-        inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
-        forces = -jnp.einsum("aen...,de...->dna...", inverse, scaled)
-    else:
-        one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
-        forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
-    forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
-    return jnp.where(grasps.valid, forces, jnp.nan)
+@dataclass(frozen=True)
+class _BlockingForces(Plain):
+    rows = 8
+
+    def evaluate(self, grasps: Grasps) -> jax.Array:
+        scaled = grasps.terms[0].wrenches * grasps.units
+        if grasps.vertex_halves is None:
+            inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+            forces = -jnp.einsum("aen...,de...->dna...", inverse, scaled)
+        else:
+            one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
+            forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
+        forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
+        return jnp.where(grasps.valid, forces, jnp.nan)

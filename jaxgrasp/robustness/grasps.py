@@ -1,7 +1,6 @@
 """From the public, batch-first arguments to the lanes that the kernels work on, with every check of the data."""
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term, Vertices
-from jaxgrasp.solvers.lanes import map_lanes
+from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
 
 
 @jax.tree_util.register_dataclass
@@ -59,23 +58,25 @@ class Grasps:
     """(3, 3, n, *lanes), R with R'R = Q_0."""
     margin: jax.Array | None
     """(*lanes), the margin that is asked for."""
+    smoothing: jax.Array | None
+    """(*lanes), kappa of the central point that is asked for."""
 
 
 def over_grasps(
-    stages: tuple[Callable[..., Any], ...],
+    kernel: Kernel,
     contacts: Contacts,
     disturbances: DisturbanceSet,
-    *options: int,
     required_wrench: Any = None,
     compliance: Any = None,
     cone_margin: Any = 0.0,
     effort_weights: Any = None,
     margin: Any = None,
+    smoothing: Any = None,
 ) -> Any:
     """Check shapes, run a kernel over all grasps of a batch and give its results the batch's shape.
 
-    The kernel's first stage is called with (grasps, *options), see `map_lanes`. The contacts' dtype is the precision of
-    everything. Compiled once for a kernel, its options and the shapes.
+    The kernel takes `Grasps`. The contacts' dtype is the precision of everything. Compiled once for a kernel (they
+    compare by value) and the shapes.
 
     Raises:
         ValueError: shapes or kinds of argument that do not fit.
@@ -90,18 +91,19 @@ def over_grasps(
         "cone_margin": cone_margin,
         "effort_weights": effort_weights,
         "margin": margin,
+        "smoothing": smoothing,
     }
     for name, value in given.items():
         if value is not None and not isinstance(value, Compliance):
             given[name] = as_float(name, value, ())
-    return _run(stages, options, contacts, disturbances, given)
+    return _run(kernel, contacts, disturbances, given)
 
 
-@functools.partial(compiled, static_argnums=(0, 1))
-def _run(stages: tuple, options: tuple, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Any:
-    """Lay the arguments out for `map_lanes`: which leaves have the batch axes, and which all grasps share."""
+@functools.partial(compiled, static_argnums=(0,))
+def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Any:
+    """Lay the arguments out in lanes: which leaves have the batch axes, and which all grasps share."""
     required_wrench, compliance, cone_margin = given["required_wrench"], given["compliance"], given["cone_margin"]
-    effort_weights, margin = given["effort_weights"], given["margin"]
+    effort_weights = given["effort_weights"]
     n = contacts.n_c
     own = {name: (getattr(contacts, name), contacts.batch_shape) for name in _CONTACT_LEAVES}
     other: dict[str, tuple[Any, tuple[int, ...]]] = {
@@ -114,8 +116,9 @@ def _run(stages: tuple, options: tuple, contacts: Contacts, disturbances: Distur
         other["compliance"] = _compliance(compliance, n)
     if effort_weights is not None:
         other["weights"] = _argument("effort_weights", effort_weights, (n, 3, 3))
-    if margin is not None:
-        other["margin"] = _argument("margin", margin, ())
+    for name in ("margin", "smoothing"):
+        if given[name] is not None:
+            other[name] = _argument(name, given[name], ())
     batch = broadcast_batch(
         contacts=contacts.batch_shape,
         disturbances=disturbances.batch_shape,
@@ -126,7 +129,7 @@ def _run(stages: tuple, options: tuple, contacts: Contacts, disturbances: Distur
     lead = batch if disturbances.batch_shape else ()
     spread = jax.tree.unflatten(structure, terms)
     leaves = {**own, **other, **{f"term {i}": (leaf, lead) for i, leaf in enumerate(terms)}}
-    leaves |= {f"extent {i}": (term.extent(), lead) for i, term in enumerate(spread.terms)}
+    leaves |= {f"extent {i}": (jax.lax.stop_gradient(term.extent()), lead) for i, term in enumerate(spread.terms)}
 
     arguments, shared = {}, {}
     for name, (leaf, lead) in leaves.items():
@@ -137,16 +140,15 @@ def _run(stages: tuple, options: tuple, contacts: Contacts, disturbances: Distur
             leaf = jnp.broadcast_to(leaf, (*batch, *event)).reshape(-1, *event)
         arguments[name] = leaf
 
-    def run(raw: dict[str, jax.Array]) -> Any:
+    def admit(raw: dict[str, jax.Array]) -> Grasps:
         terms = jax.tree.unflatten(structure, [raw[f"term {i}"] for i in range(structure.num_leaves)])
         extents = tuple(raw[f"extent {i}"] for i in range(len(terms.terms)))
-        return stages[0](_admit(raw, terms.terms, extents), *options)
+        return _admit(raw, terms.terms, extents)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
     compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
-    # The edges of the pyramid, if any; for fewer than eight, tiles are large enough.
-    edges = max([8, *options])
-    out = map_lanes((run, *stages[1:]), arguments, shared, n * (edges + 1), compact=compact)
+    lanes = Lanes(admit, shared, n * (kernel.rows + 1), compact)
+    out = differentiable(kernel, lanes, arguments)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
@@ -215,12 +217,17 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
     if margin is not None:
         valid &= (margin >= 0) & jnp.isfinite(margin)
         margin = jnp.where(valid, margin, 0)
+    smoothing = raw.get("smoothing")
+    if smoothing is not None:
+        valid &= (smoothing > 0) & jnp.isfinite(smoothing)
+        smoothing = jnp.where(valid, smoothing, 1)
 
     there = active & valid
     positions = jnp.where(there, jnp.moveaxis(positions, 1, 0), 0)
     frames = jnp.where(there, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
     mean = fold(jnp.add, fold(jnp.add, positions**2)) / jnp.maximum(fold(jnp.add, there.astype(dtype)), 1)
-    length = jnp.sqrt(jnp.where(mean > 0, mean, 1))
+    # A choice of units: nothing that is reported in newtons and metres depends on it.
+    length = jax.lax.stop_gradient(jnp.sqrt(jnp.where(mean > 0, mean, 1)))
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, raw["wrench"], 0)
     return Grasps(
@@ -240,6 +247,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
         weights=weights,
         weight_roots=weight_roots,
         margin=margin,
+        smoothing=smoothing,
     )
 
 

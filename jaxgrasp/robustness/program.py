@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, row_basis
+from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, whitened
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.fence import fenced
 from jaxgrasp.robustness.grasps import Grasps
@@ -101,6 +102,11 @@ class Program:
         terms = [self.basis.operations[r] * kept[r] for r in range(6)]
         return fold(jnp.add, terms) / self.mean * units
 
+    def wrench_multipliers_adjoint(self, y: jax.Array, units: jax.Array) -> jax.Array:
+        """The transpose of `wrench_multipliers`."""
+        y = y * units / self.mean
+        return fold(jnp.add, [self.basis.operations[:, c] * y[c] for c in range(6)]) * self.basis.kept
+
 
 def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     """Scale the programs of a batch of grasps."""
@@ -116,7 +122,8 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         sigma = jnp.concatenate([cone / tangential, (bound / normal)[None]])
         largest = fold(jnp.maximum, fold(jnp.maximum, sigma))
         undisturbed = largest == 0
-        scale = 1 / jnp.where(undisturbed, 1, largest)
+        # A choice of units, like the mean below: no derivative depends on it.
+        scale = lax.stop_gradient(1 / jnp.where(undisturbed, 1, largest))
         sigma = jnp.where(undisturbed, present, sigma * scale)
         # What is left of a zero after rounding is a zero.
         sigma = jnp.where(sigma > 8 * jnp.finfo(dtype).eps, sigma, 0)
@@ -126,9 +133,9 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
 
     sigma, h, scale, undisturbed = scale_rows(cone, bound, tangential, normal, grasps.reserve)
     mean = fold(jnp.add, normal * present) / jnp.maximum(fold(jnp.add, present), 1)
-    mean = jnp.where(mean > 0, mean, 1)
+    mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
     columns = grasps.columns * (jnp.stack([tangential, tangential, normal]) / mean)
-    rows = row_basis(columns)
+    rows = whitened(columns)
     wrench = grasps.wrench / mean
     coordinates, kept = rows.coordinates(wrench), rows.kept
     largest = fold(jnp.maximum, jnp.abs(wrench))

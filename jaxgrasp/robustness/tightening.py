@@ -1,6 +1,7 @@
 """Tightening forces: the largest-minimum resisted disturbance (21) and the least effort (22)."""
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,32 +12,33 @@ from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.derivatives import CentralPoint, Point, central_kappa, centred, envelope_adjoint
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.kernels import Along
+from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem
 from jaxgrasp.robustness.program import Program, scaled_program
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block_kkt import Record
-from jaxgrasp.solvers.effort_problem import EffortProblem
-from jaxgrasp.solvers.margin_problem import MarginProblem
+from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.status import Status
 
 _SETTINGS = {
-    "float64": interior_point.Settings(
+    "float64": Settings(
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=False, safeguard=0.0, patience=8
     ),
-    "float32": interior_point.Settings(
+    "float32": Settings(
         tolerance=5e-6, max_iterations=40, step_cap=1e-3, mu_floor=3e-8, equal_steps=True, safeguard=1e-3, patience=5
     ),
 }
 _EFFORT_SETTINGS = {
-    "float64": interior_point.Settings(
+    "float64": Settings(
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
     ),
-    "float32": interior_point.Settings(
+    "float32": Settings(
         tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=5
     ),
 }
-_REFINEMENTS = {"float64": 0, "float32": 1}
 # A gap that did not close to the tolerance still counts as solved below this one.
 _ACCEPTED_GAP = {"float64": 1e-7, "float32": 1e-4}
 
@@ -48,6 +50,7 @@ def largest_disturbance(
     compliance: ArrayLike | Compliance | None = None,
     cone_edges: int = 8,
     cone_margin: ArrayLike = 0.0,
+    smoothing: ArrayLike | None = None,
 ) -> Solution:
     """The robustness margin (21): the largest factor by which the disturbances may be scaled while the grasp holds.
 
@@ -64,6 +67,9 @@ def largest_disturbance(
             (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity.
         cone_edges: n_e, edges of the friction pyramid, which is inscribed in Coulomb's cone.
         cone_margin: d (*batch,), N, >= 0: what every facet row keeps in reserve.
+        smoothing: kappa (*batch,), > 0, in units of the margin: answer with the central point, where s z = kappa in
+            every row, instead of the optimum. Margin and forces are then smooth and unique, and the margin is below
+            the optimum by about kappa for every active row. None is the exact optimum.
 
     Returns:
         Solution with `*batch` axes. `margin` is attained by `forces`, and no forces reach more than `upper_bound`.
@@ -77,13 +83,13 @@ def largest_disturbance(
     """
     pyramid_facets(cone_edges)
     return over_grasps(
-        (_prepare, _solve_margin_alone),
+        _LargestDisturbance(cone_edges, smoothing is not None),
         contacts,
         disturbances,
-        cone_edges,
         required_wrench=required_wrench,
         compliance=compliance,
         cone_margin=cone_margin,
+        smoothing=smoothing,
     )
 
 
@@ -96,6 +102,7 @@ def least_effort(
     effort_weights: ArrayLike | None = None,
     cone_edges: int = 8,
     cone_margin: ArrayLike = 0.0,
+    smoothing: ArrayLike | None = None,
 ) -> Solution:
     """The tightening forces of least effort that give a chosen margin, program (22).
 
@@ -112,6 +119,8 @@ def least_effort(
             identity.
         cone_edges: n_e.
         cone_margin: d (*batch,), N, >= 0.
+        smoothing: kappa (*batch,), > 0, in units of the margin, as in `largest_disturbance`: s z = kappa / Lambda with
+            s and z scaled by max_force and Lambda the margin's natural scale. None is the exact optimum.
 
     Returns:
         Solution; `margin` is what `forces` certify, at least the one asked for up to rounding, `upper_bound` that of
@@ -126,36 +135,82 @@ def least_effort(
     """
     pyramid_facets(cone_edges)
     return over_grasps(
-        (_prepare, _solve_both),
+        _LeastEffort(cone_edges, smoothing is not None),
         contacts,
         disturbances,
-        cone_edges,
         required_wrench=required_wrench,
         compliance=compliance,
         cone_margin=cone_margin,
         effort_weights=effort_weights,
         margin=margin,
+        smoothing=smoothing,
     )
 
 
-def _prepare(grasps: Grasps, cone_edges: int) -> tuple[Grasps, Program]:
-    program = scaled_program(grasps, cone_edges)
-    return replace(grasps, terms=(), extents=()), program
+@dataclass(frozen=True)
+class _Tightening:
+    """What the kernels of (21) and (22) share."""
+
+    cone_edges: int
+    smooth: bool
+
+    @property
+    def rows(self) -> int:
+        return max(8, self.cone_edges)
+
+    @property
+    def stages(self) -> tuple:
+        return (lambda grasps, _: self._prepare(grasps), lambda prepared: self._solve(*prepared))
+
+    def _prepare(self, grasps: Grasps) -> tuple[Grasps, Program]:
+        program = scaled_program(grasps, self.cone_edges)
+        return replace(grasps, terms=(), extents=()), program
+
+    def _solve(self, grasps: Grasps, program: Program) -> Solution:
+        raise NotImplementedError
+
+    def _central(self, along: Along, point: Point) -> Point:
+        """The derivative of everything at the central point, which is the point itself where smoothing is asked for."""
+        kernel = CentralPoint(self.cone_edges)
+        return kernel.tangents(along, point if self.smooth else along.value(kernel, point))
 
 
-def _solve_margin_alone(prepared: tuple[Grasps, Program]) -> Solution:
-    return _solve_margin(*prepared)[0]
+class _LargestDisturbance(_Tightening):
+    def _solve(self, grasps: Grasps, program: Program) -> Solution:
+        return _solve_margin(grasps, program)[0]
+
+    def tangents(self, along: Along, out: Solution) -> Solution:
+        point = _point_of(out, jnp.isfinite(out.margin))
+        change = self._central(along, point)
+        if not self.smooth:
+            adjoint = partial(envelope_adjoint, self.cone_edges)
+            change = change._replace(margin=along.adjoint(adjoint, point, (out.margin,))[0])
+        return _changed(out, change)
 
 
-def _solve_both(prepared: tuple[Grasps, Program]) -> Solution:
-    return _solve_effort(*prepared, *_solve_margin(*prepared))
+class _LeastEffort(_Tightening):
+    def _solve(self, grasps: Grasps, program: Program) -> Solution:
+        return _solve_effort(grasps, program, *_solve_margin(grasps, program))
+
+    def tangents(self, along: Along, out: Solution) -> Solution:
+        return _changed(out, self._central(along, _point_of(out, jnp.isfinite(out.effort))))
+
+
+def _point_of(solution: Solution, usable: jax.Array) -> Point:
+    return Point(usable=usable, **{name: getattr(solution, name) for name in Point._fields if name != "usable"})
+
+
+def _changed(out: Solution, change: Point) -> Solution:
+    """A change of a solution; None for what does not vary, or counts as if it did not."""
+    varying = change._asdict() | {"upper_bound": change.margin}
+    return Solution(**{f.name: varying.get(f.name) for f in fields(out)})
 
 
 def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     """(21) for lanes; also the scaled record, from which (22) starts."""
     dtype = program.rhs.dtype
-    settings, refinements = _SETTINGS[dtype.name], _REFINEMENTS[dtype.name]
-    problem = MarginProblem((program.blocks,), program.rhs, program.dropped, program.radius, refinements)
+    problem = margin_problem(program)
+    settings, slack = _towards_centre(_SETTINGS[dtype.name], grasps, program)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     # Without a load, no forces at all are an answer with margin 0, exactly.
     idle = (outcome.record.lower < 0) & (program.rhs == 0).all(0) & (grasps.reserve == 0)
@@ -165,7 +220,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     )
     low, high = record.lower, record.upper
     size = jnp.maximum(1, jnp.abs(low))
-    closed = high - low <= _ACCEPTED_GAP[dtype.name] * jnp.where(jnp.isinf(low), 1, size)
+    closed = high - low <= _ACCEPTED_GAP[dtype.name] * jnp.where(jnp.isinf(low), 1, size) + slack
     bearable = low >= -settings.tolerance
 
     margin, upper = low * program.scale, high * program.scale
@@ -197,7 +252,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
         margin=margin,
         upper_bound=upper,
         forces=jnp.where(answered, forces, jnp.nan),
-        effort=jnp.where(answered, _effort(forces, None), jnp.nan),
+        effort=jnp.where(answered, effort_of(forces, None), jnp.nan),
         status=status,
         iterations=outcome.iterations,
         primal_residual=problem.violations(record.x, low),
@@ -208,13 +263,27 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
         bound_multipliers=multipliers[-1],
         wrench_multipliers=program.wrench_multipliers(record.y, grasps.units) * scale,
     )
-    return solution, record
+    if grasps.smoothing is None:
+        return solution, record
+    return _at_centre(grasps, program, outcome.iterate, solution), record
 
 
-def _effort(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
-    weighed = forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
-    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed))
+def _towards_centre(settings: Settings, grasps: Grasps, program: Program) -> tuple[Settings, jax.Array | float]:
+    """Where smoothing is asked for, the loop aims at the central point, whose gap is kappa for every row."""
+    if grasps.smoothing is None:
+        return settings, 0.0
+    kappa = central_kappa(grasps, program)
+    gap = 2 * kappa * program.sigma.shape[0] * fold(jnp.add, grasps.present)
+    return settings._replace(tolerance=jnp.maximum(settings.tolerance, gap), mu_floor=kappa), gap
+
+
+def _at_centre(grasps: Grasps, program: Program, iterate: Iterate, solution: Solution) -> Solution:
+    """The solution with the central point in place of the best one."""
+    point = centred(grasps, program, iterate, jnp.isfinite(solution.effort) & jnp.isfinite(solution.margin))
+    failed = (solution.status == Status.SOLVED) & ~point.usable
+    values = {name: getattr(point, name) for name in Point._fields if name != "usable"}
+    kept = {name: jnp.where(point.usable, value, getattr(solution, name)) for name, value in values.items()}
+    return replace(solution, **kept, status=jnp.where(failed, Status.MAX_ITERATIONS, solution.status))
 
 
 def _largest(rows: tuple) -> jax.Array:
@@ -224,42 +293,26 @@ def _largest(rows: tuple) -> jax.Array:
 def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Record) -> Solution:
     """(22) for lanes, from what (21) left."""
     dtype, blocks = program.rhs.dtype, program.blocks
-    settings, refinements = _EFFORT_SETTINGS[dtype.name], _REFINEMENTS[dtype.name]
-    sigma = jnp.where(program.undisturbed, 0, blocks.sigma)
-    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.margin / program.scale)
+    settings, slack = _towards_centre(_EFFORT_SETTINGS[dtype.name], grasps, program)
+    problem, wanted, unit = effort_problem(grasps, program)
     reachable = grasps.margin <= first.upper_bound * (1 + settings.tolerance)
     held = (reachable & jnp.isfinite(record.lower)) | program.undisturbed
 
-    units = jnp.stack([program.tangential, program.tangential, program.normal])
-    eye = jnp.eye(3, dtype=dtype)[..., None, None]
-    # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
-    root = eye if grasps.weight_roots is None else grasps.weight_roots
-    root = root * units * blocks.present
-    largest = fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root))))
-    largest = jnp.where(largest > 0, largest, 1)
-
     # Between (21)'s answer and its start, which is deep inside the rows, but for those that the margin asks for.
-    problem = MarginProblem((blocks,), program.rhs, program.dropped, program.radius, refinements)
-    centre = problem.start().x[0]
-    attained = problem.attained(centre)
+    largest = margin_problem(program)
+    centre = largest.start().x[0]
+    attained = largest.attained(centre)
     # Where the start misses rows that lambda does not move, it attains nothing.
     share = (wanted - attained) / jnp.maximum(record.lower - attained, 1e-3)
     share = 0.5 * (1 + jnp.where(jnp.isfinite(attained), jnp.clip(share, 0, 1), 0))
-    problem = EffortProblem(
-        (blocks._replace(h=blocks.h - sigma * wanted, hessian=root / largest),),
-        program.rhs,
-        program.dropped,
-        program.radius,
-        refinements,
-        tuple(share * x + (1 - share) * c for x, c in zip(record.x, centre, strict=True)),
-    )
+    problem = replace(problem, guess=tuple(share * x + (1 - share) * c for x, c in zip(record.x, centre, strict=True)))
     active = grasps.valid & ~program.wrench_outside & held & (first.status != Status.INFEASIBLE)
     # Without a load and a margin no forces at all are the answer, exactly.
     idle = active & (fold(jnp.maximum, jnp.abs(program.rhs)) == 0) & (wanted == 0) & (grasps.reserve == 0)
     outcome = interior_point.solve(problem, settings, active & ~idle)
     best = jax.tree.map(lambda x: jnp.where(idle, 0, x), outcome.record)
     gap = (best.upper - best.lower) / problem.gap_scale(best)
-    closed = gap <= _ACCEPTED_GAP[dtype.name]
+    closed = gap <= _ACCEPTED_GAP[dtype.name] + slack / problem.gap_scale(best)
 
     status = jnp.select(
         [~grasps.valid, ~active, closed, program.doubtful],
@@ -268,18 +321,16 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     ).astype(jnp.int32)
     answered = active & jnp.isfinite(best.upper)
     hide = lambda x: jnp.where(answered, x, jnp.nan)  # noqa: E731
-    attained = MarginProblem(
-        (blocks._replace(sigma=sigma),), program.rhs, program.dropped, program.radius, refinements
-    ).attained(best.x)
+    attained = largest.attained(best.x)
     attained = jnp.where(program.undisturbed, jnp.inf, attained * program.scale)
     attained = jnp.where(program.disturbance_outside | program.slippery, 0, attained)
     forces = program.forces(best.x[0]) * blocks.present[:, None]
-    multipliers = best.z[0] * largest**2 / program.row_units()
-    return Solution(
+    multipliers = best.z[0] * unit**2 / program.row_units()
+    solution = Solution(
         margin=hide(attained),
         upper_bound=first.upper_bound,
         forces=hide(forces),
-        effort=hide(_effort(forces, grasps.weights)),
+        effort=hide(effort_of(forces, grasps.weights)),
         status=status,
         iterations=first.iterations + outcome.iterations,
         primal_residual=hide(problem.violations(best.x, jnp.zeros_like(wanted))),
@@ -288,5 +339,8 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
         rank=program.rank,
         cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
         bound_multipliers=multipliers[-1],
-        wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * largest**2,
+        wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * unit**2,
     )
+    if grasps.smoothing is None:
+        return solution
+    return _at_centre(grasps, program, outcome.iterate, solution)

@@ -5,19 +5,24 @@ most h_D(-(C G*)_ik) and the bound on its normal force at most h_D((E G*)_i): S_
 whatever kind of set D is.
 """
 
+from dataclasses import dataclass, replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, Compliance, pseudo_inverse
+from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, Compliance, pseudo_inverse, pseudo_inverse_adjoint
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.disturbance.sets import support
+from jaxgrasp.disturbance.sets import furthest, support
+from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.fence import each, fenced
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.kernels import Plain
 
 
 def worst_case(
@@ -42,22 +47,46 @@ def worst_case(
         ValueError: shapes or options that do not fit.
     """
     pyramid_facets(cone_edges)
+    return over_grasps(_WorstCase(cone_edges), contacts, disturbances, compliance=compliance)
 
-    return over_grasps((_worst_kernel,), contacts, disturbances, cone_edges, compliance=compliance)
 
+@dataclass(frozen=True)
+class _WorstCase(Plain):
+    cone_edges: int
 
-def _worst_kernel(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array]:
-    cone, bound, _ = worst_rows(grasps, cone_edges)
-    hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)  # noqa: E731
-    return hide(jnp.moveaxis(-cone, 0, 1)), hide(bound)
+    @property
+    def rows(self) -> int:
+        return max(8, self.cone_edges)
+
+    def evaluate(self, grasps: Grasps) -> tuple[jax.Array, jax.Array]:
+        cone, bound, _ = worst_rows(grasps, self.cone_edges)
+        hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)  # noqa: E731
+        return hide(jnp.moveaxis(-cone, 0, 1)), hide(bound)
 
 
 def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, Basis]:
     """-S_1 (n_e, n, *lanes), S_2 (n, *lanes) and the basis of G's rows; lanes trail."""
+    inverse, basis = pseudo_inverse(grasps.columns, grasps.half)
+    if grasps.vertex_halves is None:
+        reach = fenced(support)(grasps.terms, _directions(inverse, grasps.friction, grasps.units, cone_edges))
+    else:
+
+        def worse(reach: jax.Array, vertex: tuple) -> tuple[jax.Array, None]:
+            half, wrench = vertex
+            rows = _directions(pseudo_inverse(grasps.columns, half)[0], grasps.friction, grasps.units, cone_edges)
+            return jnp.maximum(reach, fold(jnp.add, rows * wrench[:, None, None])), None
+
+        reach = jnp.zeros((cone_edges + 1, *grasps.present.shape), grasps.present.dtype)
+        reach, _ = lax.scan(worse, reach, (grasps.vertex_halves, grasps.terms[0].wrenches))
+    reach = jnp.where(grasps.present > 0, reach, 0)
+    return reach[:-1], reach[-1], basis
+
+
+def _directions(inverse: jax.Array, friction: jax.Array, units: jax.Array, cone_edges: int) -> jax.Array:
+    """Wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6, n, *lanes)."""
 
     @fenced
-    def directions(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
-        """Wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6, n, *lanes)."""
+    def spread(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
         c, s, k = literal(pyramid_facets(cone_edges).T, inverse.dtype)[..., None, None]
 
         def component(each_wrench: tuple) -> jax.Array:
@@ -67,20 +96,64 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, B
 
         return each(component, (jnp.moveaxis(inverse, 1, 0), units))
 
-    inverse, basis = pseudo_inverse(grasps.columns, grasps.half)
-    if grasps.vertex_halves is None:
-        reach = fenced(support)(grasps.terms, directions(inverse, grasps.friction, grasps.units))
-    else:
+    return spread(inverse, friction, units)
 
-        def worse(reach: jax.Array, vertex: tuple) -> tuple[jax.Array, None]:
-            half, wrench = vertex
-            rows = directions(pseudo_inverse(grasps.columns, half)[0], grasps.friction, grasps.units)
-            return jnp.maximum(reach, fold(jnp.add, rows * wrench[:, None, None])), None
 
-        reach = jnp.zeros((cone_edges + 1, *grasps.present.shape), grasps.present.dtype)
-        reach, _ = lax.scan(worse, reach, (grasps.vertex_halves, grasps.terms[0].wrenches))
-    reach = jnp.where(grasps.present > 0, reach, 0)
-    return reach[:-1], reach[-1], basis
+def reach_adjoint(
+    grasps: Grasps, cone: jax.Array, bound: jax.Array, cone_edges: int, with_terms: bool
+) -> tuple[jax.Array, jax.Array, jax.Array | None, tuple[Term, ...] | None]:
+    """The transpose of the derivative of -S_1 and S_2.
+
+    Of a row a'G* that the worst wrench w of the set turns into h_D, da'w is left: the gradient with respect to G* is
+    a sum of w a' over the rows.
+
+    Args:
+        grasps: the grasps.
+        cone: (n_e, n, *lanes), cotangents of -S_1.
+        bound: (n, *lanes), of S_2.
+        cone_edges: n_e.
+        with_terms: whether those of the disturbance set are wanted.
+
+    Returns:
+        Cotangents of the columns of G, friction, the roots of compliance (None for Q = I) and of the terms (None where
+        not wanted).
+    """
+    weights = jnp.where(grasps.present > 0, jnp.concatenate([cone, bound[None]]), 0)
+    if grasps.vertex_halves is not None or with_terms:
+        # Rare, and nothing to save: by JAX's own hand.
+        data = (grasps.columns, grasps.friction, grasps.half, grasps.vertex_halves, grasps.terms)
+
+        def reach(columns: jax.Array, friction: jax.Array, half: Any, vertex_halves: Any, terms: Any) -> tuple:
+            changed = replace(
+                grasps, columns=columns, friction=friction, half=half, vertex_halves=vertex_halves, terms=terms
+            )
+            return worst_rows(changed, cone_edges)[:2]
+
+        columns, friction, half, vertex_halves, terms = jax.vjp(reach, *data)[1]((weights[:-1], weights[-1]))
+        return columns, friction, half if vertex_halves is None else vertex_halves, terms
+
+    inverse, _ = pseudo_inverse(grasps.columns, grasps.half)
+    worst = fenced(furthest)(grasps.terms, _directions(inverse, grasps.friction, grasps.units, cone_edges))
+
+    @fenced
+    def gather(worst: jax.Array, weights: jax.Array, friction: jax.Array, units: jax.Array) -> tuple:
+        c, s, k = literal(pyramid_facets(cone_edges).T, weights.dtype)[..., None, None]
+
+        def component(each_wrench: tuple) -> tuple:
+            worst, unit = each_wrench
+            pulled = worst * weights * unit
+            cone = pulled[:-1]
+            along_normal = fold(jnp.add, cone * k)
+            normal = pulled[-1] - friction * along_normal
+            return jnp.stack([-fold(jnp.add, cone * c), -fold(jnp.add, cone * s), normal]), along_normal
+
+        return each(component, (worst, units))
+
+    # (6, 3, n, *lanes), of the blocks of G*, and what comes with friction.
+    pulled, along_normal = gather(worst, weights, grasps.friction, grasps.units)
+    friction = -fold(jnp.add, along_normal * inverse[2])
+    columns, half = pseudo_inverse_adjoint(grasps.columns, grasps.half, pulled)
+    return columns, friction, half, None
 
 
 def reaches_outside(grasps: Grasps, basis: Basis) -> jax.Array:

@@ -15,7 +15,7 @@ scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1; ra
 Callers scale: |x| about 1 at most, sigma <= 1, the rows of E orthonormal or zero.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -167,8 +167,8 @@ class BlockProblem:
     groups: tuple[Blocks, ...]
     rhs: jax.Array
     dropped: jax.Array
-    radius: float
-    refinements: int
+    radius: float = field(metadata={"static": True})
+    refinements: int = field(metadata={"static": True})
     bordered = True
 
     @property
@@ -271,7 +271,7 @@ class BlockProblem:
         reduced = fenced(lambda below, inverse: _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
         return _BlockFactor(below, inverse, reduced(below, inverse), theta, lean)
 
-    def _newton(self, factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
+    def newton(self, factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
         """Solve [P p E'; p' hll 0; E 0 0] (dx, dlambda, dy) = (rhs_x, rhs_lambda, rhs_y)."""
 
         @fenced

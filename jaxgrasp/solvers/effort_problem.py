@@ -21,6 +21,7 @@ from jaxgrasp.solvers.block_kkt import (
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EffortProblem(BlockProblem):
     """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at.
@@ -73,7 +74,7 @@ class EffortProblem(BlockProblem):
                     self.groups, residuals.dual, shift, factors.weights, rows, dx, self.pull_back(dy), strict=True
                 )
             )
-            more_x, _, more_y = self._newton(factors, rhs, None, -residuals.primal - self.equality(dx))
+            more_x, _, more_y = self.newton(factors, rhs, None, -residuals.primal - self.equality(dx))
             dx = tuple(d + m for d, m in zip(dx, more_x, strict=True))
             return dx, dy + more_y, tuple(apply_rows(g, d) for g, d in zip(self.groups, dx, strict=True))
 

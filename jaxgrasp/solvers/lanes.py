@@ -57,7 +57,7 @@ def map_lanes(
 def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int) -> Callable:
     @custom_vmap
     def run(leaves: list[jax.Array]) -> Tree:
-        return _tiled(stages, structure, shared, rows, leaves)
+        return tiled(stages, structure, shared, rows, leaves)
 
     @run.def_vmap
     def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
@@ -81,9 +81,10 @@ def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...],
     return run
 
 
-def _tiled(
+def tiled(
     stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int, leaves: list[jax.Array]
 ) -> Tree:
+    """`map_lanes` of leaves, without a rule for `jax.vmap`; rows are 0 where tiles cannot be compact."""
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
 
     def enter(parts: list[jax.Array]) -> Tree:

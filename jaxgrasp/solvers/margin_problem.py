@@ -21,6 +21,7 @@ from jaxgrasp.solvers.block_kkt import (
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MarginProblem(BlockProblem):
     """max lambda; x is (blocks, lambda).
@@ -117,7 +118,7 @@ class MarginProblem(BlockProblem):
 
         def improve(_: jax.Array, state: tuple) -> tuple:
             (dx, dlambda), dy, rows = state
-            more_x, more_lambda, more_y = self._newton(factors, *lacking(factors.weights, dx, dlambda, dy, rows))
+            more_x, more_lambda, more_y = self.newton(factors, *lacking(factors.weights, dx, dlambda, dy, rows))
             dx = tuple(d + m for d, m in zip(dx, more_x, strict=True))
             return (dx, dlambda + more_lambda), dy + more_y, change(dx, dlambda + more_lambda)
 

@@ -1,0 +1,281 @@
+"""How the answers of (21) and (22) vary with everything that they depend on.
+
+The margin of (21) by the envelope theorem: d margin is the partial derivative of the Lagrangian
+
+    lambda - z_1'(C f_0 - S_1 lambda + d) - z_2'(-E f_0 + S_2 lambda - f_max) - y'(G f_0 - b)
+
+with forces, margin and multipliers held: no linear system is solved, and the margin may be negative. Everything else,
+and the margin itself where smoothing is asked for, by the implicit function theorem at a central point, see
+`sensitivity`.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxgrasp.arrays import fold, literal
+from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.robustness.grasps import Grasps
+from jaxgrasp.robustness.kernels import Along
+from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem
+from jaxgrasp.robustness.program import Program, scaled_program
+from jaxgrasp.robustness.worst_case import reach_adjoint
+from jaxgrasp.solvers.block_kkt import BlockProblem, adjoint_rows, apply_rows, total
+from jaxgrasp.solvers.interior_point import Iterate
+from jaxgrasp.solvers.sensitivity import central_point, change_of_rows, solve_symmetric
+
+# kappa, relative to the margin's natural scale, of the central points whose derivatives stand for those of the exact
+# forces, and the largest residual with which they count as found.
+_KAPPA = {"float64": 1e-8, "float32": 1e-5}
+_FOUND = {"float64": 1e-9, "float32": 1e-4}
+
+
+class Point(NamedTuple):
+    """A point of (21) or (22) with multipliers, in newtons and metres as in `Solution`; lanes trail or lead."""
+
+    margin: jax.Array
+    forces: jax.Array
+    effort: jax.Array
+    cone_multipliers: jax.Array
+    bound_multipliers: jax.Array
+    wrench_multipliers: jax.Array
+    usable: jax.Array
+    """bool (*lanes): where it is one."""
+
+
+class RowWeights(NamedTuple):
+    """What a cotangent asks of the rows: of C f + h lambda + d and -f_n + h lambda - f_max, with h = -S_1 or S_2.
+
+    cone, bound: (n_e, n, *lanes) and (n, *lanes), of the rows' values.
+    cone_reach, bound_reach: the same, of h.
+    friction: (n, *lanes).
+    columns: (6, 3, n, *lanes), of the blocks of G, moments as in `Grasps`.
+    wrench: (6, *lanes), of b.
+    weights: (n, 3, 3, *lanes), of Q_0; None where there is none.
+    margin: (*lanes), of the margin that is asked for; None where none is.
+    """
+
+    cone: jax.Array
+    bound: jax.Array
+    cone_reach: jax.Array
+    bound_reach: jax.Array
+    friction: jax.Array
+    columns: jax.Array
+    wrench: jax.Array
+    weights: jax.Array | None = None
+    margin: jax.Array | None = None
+
+
+def envelope_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: tuple, names: frozenset) -> Grasps:
+    """The gradient of (21)'s Lagrangian with respect to the data, times a cotangent (*lanes)."""
+    weight = jnp.where(point.usable, cotangents[0], 0)
+    clean = lambda x: jnp.where(point.usable, x, 0)  # noqa: E731
+    force, z_cone = clean(jnp.moveaxis(point.forces, 1, 0)), clean(jnp.moveaxis(point.cone_multipliers, 1, 0))
+    z_cone, z_bound = -z_cone * weight * grasps.present, -clean(point.bound_multipliers) * weight * grasps.present
+    y = clean(point.wrench_multipliers) * weight
+    margin = clean(point.margin)
+    normal = literal(pyramid_facets(cone_edges)[:, 2], force.dtype)[:, None, None]
+    rows = RowWeights(
+        cone=z_cone,
+        bound=z_bound,
+        cone_reach=z_cone * margin,
+        bound_reach=z_bound * margin,
+        friction=fold(jnp.add, z_cone * normal) * force[2],
+        columns=-(y / grasps.units)[:, None, None] * force,
+        wrench=y / grasps.units,
+    )
+    return _to_grasps(grasps, rows, cone_edges, names)
+
+
+def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, names: frozenset) -> Grasps:
+    """Cotangents of the data, from those of the rows."""
+    zero = jax.tree.map(_nothing, grasps)
+    columns, friction, half, terms = reach_adjoint(
+        grasps, rows.cone_reach, rows.bound_reach, cone_edges, any(name.startswith("term") for name in names)
+    )
+    if grasps.vertex_halves is not None:
+        zero = replace(zero, vertex_halves=half)
+    elif grasps.half is not None:
+        zero = replace(zero, half=half)
+    if rows.weights is not None:
+        zero = replace(zero, weights=rows.weights)
+    if rows.margin is not None:
+        zero = replace(zero, margin=rows.margin)
+    return replace(
+        zero,
+        friction=rows.friction + friction,
+        max_force=-rows.bound,
+        reserve=fold(jnp.add, fold(jnp.add, rows.cone)),
+        columns=rows.columns + columns,
+        wrench=rows.wrench,
+        terms=zero.terms if terms is None else terms,
+    )
+
+
+def _nothing(x: jax.Array) -> jax.Array | np.ndarray:
+    return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
+
+
+@dataclass(frozen=True)
+class CentralPoint:
+    """The kernel that finds the central point next to a point of (21) or, where a margin is asked for, of (22)."""
+
+    cone_edges: int
+
+    @property
+    def rows(self) -> int:
+        """See `Kernel`."""
+        return max(8, self.cone_edges)
+
+    @property
+    def stages(self) -> tuple:
+        """See `Kernel`; the point is held."""
+        return (self._prepare, lambda prepared: self._find(*prepared))
+
+    def _prepare(self, grasps: Grasps, point: Point) -> tuple[Grasps, Program, Point]:
+        program = scaled_program(grasps, self.cone_edges)
+        return replace(grasps, terms=(), extents=()), program, point
+
+    def _find(self, grasps: Grasps, program: Program, point: Point) -> Point:
+        problem, unit = _problem(grasps, program)
+        return centred(grasps, program, _iterate(problem, program, point, unit, None), point.usable)
+
+    def tangents(self, along: Along, out: Point) -> Point:
+        """See `Kernel`."""
+        return along.adjoint(partial(_central_adjoint, self.cone_edges), out, out._replace(usable=None))
+
+
+def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: Point, names: frozenset) -> Grasps:
+    """From cotangents of a central point to those of the data: one solve with the symmetric matrix."""
+    program = scaled_program(grasps, cone_edges)
+    problem, unit = _problem(grasps, program)
+    (group,), kappa = problem.groups, central_kappa(grasps, program)
+    iterate = _iterate(problem, program, point, unit, kappa)
+    (z,), (s,) = iterate.z, iterate.s
+    forces = jnp.where(point.usable, point.forces, 0)
+    scales = jnp.stack([program.tangential, program.tangential, program.normal])
+    row_units = program.row_units()
+    given = lambda ct: None if ct is None else jnp.where(point.usable, ct, 0)  # noqa: E731
+    ct = Point(*map(given, cotangents))
+
+    pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
+    effort_weights = None
+    if ct.effort is not None:
+        weighed = forces if grasps.weights is None else jnp.einsum("nab...,nb...->na...", grasps.weights, forces)
+        pull = pull + ct.effort * weighed
+        effort_weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
+    right_x = jnp.moveaxis(pull, 1, 0) * scales * grasps.present
+    right_lambda, right_y, row_pull = jnp.zeros_like(unit), jnp.zeros_like(problem.rhs), jnp.zeros_like(z)
+    if ct.cone_multipliers is not None:
+        row_pull = row_pull.at[:-1].add(jnp.moveaxis(ct.cone_multipliers, 1, 0))
+    if ct.bound_multipliers is not None:
+        row_pull = row_pull.at[-1].add(ct.bound_multipliers)
+    weights = z / s * program.present
+    row_pull = weights * row_pull * unit / row_units
+    if ct.wrench_multipliers is not None:
+        right_y = program.wrench_multipliers_adjoint(ct.wrench_multipliers, grasps.units) * unit
+    right_x = right_x + adjoint_rows(group, row_pull)
+    if problem.bordered:
+        right_lambda = total(group.sigma * row_pull)
+        if ct.margin is not None:
+            right_lambda = right_lambda + ct.margin * program.scale
+    right = ((right_x,), right_lambda if problem.bordered else None, right_y)
+    (move_x,), move_lambda, move_y = solve_symmetric(problem, (weights,), right)
+
+    # Back in newtons: forces, margin, and multipliers for an objective in the solver's unit.
+    (change,) = change_of_rows(problem, (move_x,), move_lambda)
+    values = (row_pull - weights * change) / row_units
+    z = z / row_units
+    margin = jnp.where(point.usable, point.margin, 0)
+    reach = values * margin
+    if move_lambda is not None:
+        reach = reach - z * (move_lambda * program.scale)
+    force, move = jnp.moveaxis(forces, 1, 0), move_x * scales
+    y, move_y = (program.wrench_multipliers(v, jnp.ones_like(grasps.units)) for v in (iterate.y, move_y))
+    normal = literal(pyramid_facets(cone_edges)[:, 2], z.dtype)[:, None, None]
+    asked = None
+    if grasps.margin is not None:
+        asked = total(values * group.sigma * row_units) / program.scale
+        asked = asked if ct.margin is None else asked + ct.margin
+        bend = -0.5 / unit * (force[:, None] * move + move[:, None] * force)
+        bend = jnp.moveaxis(bend, 2, 0)
+        effort_weights = bend if effort_weights is None else bend + effort_weights
+    rows = RowWeights(
+        cone=values[:-1],
+        bound=values[-1],
+        cone_reach=reach[:-1],
+        bound_reach=reach[-1],
+        friction=fold(jnp.add, normal * (values[:-1] * force[2] - z[:-1] * move[2])),
+        columns=-(y[:, None, None] * move + move_y[:, None, None] * force),
+        wrench=move_y,
+        weights=None if grasps.weights is None else effort_weights,
+        margin=asked,
+    )
+    return _to_grasps(grasps, rows, cone_edges, names)
+
+
+def central_kappa(grasps: Grasps, program: Program) -> jax.Array:
+    """What s z is at the central point, scaled, (*lanes)."""
+    if grasps.smoothing is not None:
+        return grasps.smoothing / program.scale
+    return jnp.full_like(program.scale, _KAPPA[program.scale.dtype.name])
+
+
+def centred(grasps: Grasps, program: Program, start: Iterate, active: jax.Array) -> Point:
+    """The central point that Newton's method finds from a start near by."""
+    problem, unit = _problem(grasps, program)
+    kappa = central_kappa(grasps, program)
+    centre = central_point(problem, start, kappa, active)
+    found = active & (centre.error <= _FOUND[kappa.dtype.name])
+    return _point(grasps, program, centre.iterate, unit, found)
+
+
+def _problem(grasps: Grasps, program: Program) -> tuple[BlockProblem, jax.Array]:
+    """The problem, and what its objective is measured in."""
+    if grasps.margin is None:
+        return margin_problem(program), program.scale
+    effort = effort_problem(grasps, program)
+    return effort.problem, effort.unit**2
+
+
+def _point(grasps: Grasps, program: Program, iterate: Iterate, unit: jax.Array, usable: jax.Array) -> Point:
+    blocks, margin = (iterate.x, grasps.margin) if grasps.margin is not None else iterate.x
+    forces = program.forces(blocks[0]) * grasps.present[:, None]
+    multipliers = iterate.z[0] * unit / program.row_units()
+    return Point(
+        margin=margin if grasps.margin is not None else margin * program.scale,
+        forces=forces,
+        effort=effort_of(forces, grasps.weights),
+        cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
+        bound_multipliers=multipliers[-1],
+        wrench_multipliers=program.wrench_multipliers(iterate.y, grasps.units) * unit,
+        usable=usable,
+    )
+
+
+def _iterate(
+    problem: BlockProblem, program: Program, point: Point, unit: jax.Array, kappa: jax.Array | None
+) -> Iterate:
+    """The scaled iterate; s from s z = kappa, or from the rows where kappa is None. Harmless where of no use."""
+    (group,) = problem.groups
+    clean = lambda x, other: jnp.where(point.usable, x, other)  # noqa: E731
+    forces = clean(jnp.moveaxis(point.forces, 1, 0), 0) * program.present
+    x = forces / jnp.stack([program.tangential, program.tangential, program.normal])
+    z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
+    z = clean(z * program.row_units() / unit, 1) * program.present
+    lam = clean(point.margin, 0) / program.scale
+    if kappa is None:
+        s = group.h - apply_rows(group, x) - (group.sigma * lam if problem.bordered else 0)
+        s = jnp.where(program.present > 0, clean(s, 1), 1)
+    else:
+        z = jnp.maximum(z, jnp.finfo(z.dtype).tiny * 1e8) * program.present
+        s = jnp.where(program.present > 0, clean(kappa / jnp.where(program.present > 0, z, 1), 1), 1)
+    pull = adjoint_rows(group, z)
+    if group.hessian is not None:
+        half = fold(jnp.add, jnp.moveaxis(group.hessian * x, 1, 0))
+        pull = pull + fold(jnp.add, group.hessian * half[:, None])
+    return Iterate(((x,), lam) if problem.bordered else (x,), -problem.equality((pull,)), (s,), (z,))

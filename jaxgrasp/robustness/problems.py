@@ -1,0 +1,58 @@
+"""(21) and (22) as the solver's problems, and what their unknowns mean in newtons and metres."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxgrasp.arrays import fold
+from jaxgrasp.robustness.grasps import Grasps
+from jaxgrasp.robustness.program import Program
+from jaxgrasp.solvers.block_kkt import Rows
+from jaxgrasp.solvers.effort_problem import EffortProblem
+from jaxgrasp.solvers.margin_problem import MarginProblem
+
+_REFINEMENTS = {"float64": 0, "float32": 1}
+
+
+def margin_problem(program: Program) -> MarginProblem:
+    """(21)."""
+    refinements = _REFINEMENTS[program.rhs.dtype.name]
+    return MarginProblem((program.blocks,), program.rhs, program.dropped, program.radius, refinements)
+
+
+class Effort(NamedTuple):
+    """(22): the problem (without a guess), the scaled margin that is asked for, and sqrt of the unit of effort."""
+
+    problem: EffortProblem
+    wanted: jax.Array
+    unit: jax.Array
+
+
+def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort:
+    """(22)."""
+    blocks, dtype = program.blocks, program.rhs.dtype
+    sigma = jnp.where(program.undisturbed, 0, blocks.sigma)
+    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.margin / program.scale)
+    eye = jnp.eye(3, dtype=dtype)[..., None, None]
+    # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
+    root = eye if grasps.weight_roots is None else grasps.weight_roots
+    root = root * jnp.stack([program.tangential, program.tangential, program.normal]) * blocks.present
+    largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
+    largest = jnp.where(largest > 0, largest, 1)
+    problem = EffortProblem(
+        (blocks._replace(h=blocks.h - sigma * wanted, hessian=root / largest),),
+        program.rhs,
+        program.dropped,
+        program.radius,
+        _REFINEMENTS[dtype.name],
+        guess,
+    )
+    return Effort(problem, wanted, largest)
+
+
+def effort_of(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
+    """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
+    weighed = forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
+    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed))

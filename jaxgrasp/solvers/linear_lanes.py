@@ -1,0 +1,226 @@
+"""Derivatives of lane kernels: linear maps over lanes that JAX can differentiate, transpose and batch in any nesting.
+
+`map_lanes` hides its tiles from JAX's differentiation. What belongs to a derivative goes through `linear_lanes`: a
+kernel `f(data, tangents)`, linear in `tangents`, that is again run in tiles. Its own derivatives are maps of the same
+kind, made from the kernel inside the tile:
+
+    along tangents     f(data, tangents_dot)
+    along data         d/d data f(data, tangents) . data_dot
+    transposed         f(data, .)' cotangents
+
+so reverse mode, and any order, cost one pass over the tiles each, and mapped axes become lanes. A map may come with a
+transpose of its own, written for tiles that are one function; what JAX makes of a kernel has operations that XLA's CPU
+backend does not allow in these (transposed broadcasts are reductions), so it runs without.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from jaxgrasp.solvers.lanes import tiled
+
+Tree = Any
+Kernel = Callable[[list[jax.Array], list[jax.Array]], list[jax.Array]]
+
+
+class _Map(NamedTuple):
+    """A linear map over lanes.
+
+    kernel: takes data and tangents with the lanes last.
+    shared: for every leaf of the data, whether all lanes share it.
+    outputs: shape without lanes and dtype of everything that the kernel returns.
+    adjoint: its transpose, takes data and the cotangents of all outputs, None where zero; None if there is none.
+    rows: see `map_lanes`; 0 where tiles cannot be compact.
+    """
+
+    kernel: Kernel
+    shared: tuple[bool, ...]
+    outputs: tuple[tuple[tuple[int, ...], Any], ...]
+    adjoint: Callable[[list[jax.Array], list[jax.Array | None]], list[jax.Array]] | None
+    rows: int
+
+
+def linear_lanes(kernel: Callable[[Tree, Tree], Tree], data: Tree, tangents: Tree, shared: Tree, like: Tree) -> Tree:
+    """Run a kernel that is linear in its second argument over the leading axis of its arguments.
+
+    Args:
+        kernel: takes data and tangents with the lane axis last (size 1 where shared) and returns a tree like `like`,
+            lanes last; differentiable as often as the result is to be.
+        data: leaves (lanes, ...), or without the leading axis where shared.
+        tangents: leaves (lanes, ...).
+        shared: like data, bool.
+        like: arrays with the shapes and dtypes of the result, leaves (lanes, ...).
+    """
+    given, data_structure = jax.tree.flatten(data)
+    varied, tangent_structure = jax.tree.flatten(tangents)
+    wanted, structure = jax.tree.flatten(like)
+
+    def flat(data: list[jax.Array], tangents: list[jax.Array]) -> list[jax.Array]:
+        return jax.tree.leaves(
+            kernel(jax.tree.unflatten(data_structure, data), jax.tree.unflatten(tangent_structure, tangents))
+        )
+
+    spec = _Map(flat, tuple(jax.tree.leaves(shared)), _events(wanted), None, 0)
+    return jax.tree.unflatten(structure, _bind(spec, given, varied))
+
+
+def transposed_lanes(
+    adjoint: Callable[[Tree, Tree], Tree], data: Tree, tangents: Tree, shared: Tree, like: Tree, rows: int
+) -> Tree:
+    """The linear map of which `adjoint` is the transpose; else as `linear_lanes`.
+
+    Args:
+        adjoint: takes data and cotangents (a tree like `like`, None where zero) with the lane axis last and returns
+            what is linear in the cotangents, a tree like `tangents`.
+        data: as for `linear_lanes`.
+        tangents: as for `linear_lanes`.
+        shared: as for `linear_lanes`.
+        like: as for `linear_lanes`.
+        rows: how many rows a lane has, which sets the size of a tile; 0 where the adjoint calls libraries.
+    """
+    given, data_structure = jax.tree.flatten(data)
+    varied, tangent_structure = jax.tree.flatten(tangents)
+    wanted, structure = jax.tree.flatten(like)
+
+    def flat(data: list[jax.Array], cotangents: list[jax.Array | None]) -> list[jax.Array]:
+        back = adjoint(jax.tree.unflatten(data_structure, data), jax.tree.unflatten(structure, cotangents))
+        leaves, found = jax.tree.flatten(back)
+        assert found == tangent_structure
+        return leaves
+
+    def kernel(data: list[jax.Array], tangents: list[jax.Array]) -> list[jax.Array]:
+        lanes = tangents[0].shape[-1]
+        shapes = [jax.ShapeDtypeStruct((*x.shape[1:], lanes), x.dtype) for x in wanted]
+        return jax.linear_transpose(partial(flat, data), shapes)(tangents)[0]
+
+    spec = _Map(kernel, tuple(jax.tree.leaves(shared)), _events(wanted), flat, rows)
+    return jax.tree.unflatten(structure, _bind(spec, given, varied))
+
+
+def _events(leaves: list[jax.Array]) -> tuple[tuple[tuple[int, ...], Any], ...]:
+    return tuple((x.shape[1:], x.dtype) for x in leaves)
+
+
+_linear_lanes_p = Primitive("linear_lanes")
+_linear_lanes_p.multiple_results = True
+
+
+def _bind(spec: _Map, data: list, tangents: list) -> list:
+    return _linear_lanes_p.bind(*data, *tangents, spec=spec)
+
+
+def _split(spec: _Map, args: Any) -> tuple[list, list]:
+    return list(args[: len(spec.shared)]), list(args[len(spec.shared) :])
+
+
+def _run(*args: jax.Array, spec: _Map) -> list[jax.Array]:
+    tangents = _split(spec, args)[1]
+    if not tangents[0].shape[0]:
+        return [jnp.zeros((0, *shape), dtype) for shape, dtype in spec.outputs]
+    shared = spec.shared + (False,) * len(tangents)
+    stage = lambda leaves: spec.kernel(*_split(spec, leaves))  # noqa: E731
+    return tiled((stage,), jax.tree.structure(list(args)), shared, spec.rows if spec.adjoint is None else 0, list(args))
+
+
+_linear_lanes_p.def_impl(lambda *args, spec: jax.jit(partial(_run, spec=spec))(*args))
+mlir.register_lowering(_linear_lanes_p, mlir.lower_fun(_run, multiple_results=True))
+
+
+@_linear_lanes_p.def_abstract_eval
+def _shapes(*args: Any, spec: _Map) -> list:
+    lanes = _split(spec, args)[1][0].shape[0]
+    return [jax.core.ShapedArray((lanes, *shape), dtype) for shape, dtype in spec.outputs]
+
+
+def _jvp(primals: Any, dots: Any, *, spec: _Map) -> tuple[list, list]:
+    data, tangents = _split(spec, primals)
+    data_dots, tangent_dots = _split(spec, dots)
+    out = _bind(spec, data, tangents)
+    parts = []
+    if any(type(t) is not ad.Zero for t in tangent_dots):
+        parts.append(_bind(spec, data, [ad.instantiate_zeros(t) for t in tangent_dots]))
+    moved = [i for i, t in enumerate(data_dots) if type(t) is not ad.Zero]
+    if moved:
+        lanes = tangents[0].shape[0]
+        along = [_spread(ad.instantiate_zeros(data_dots[i]), lanes) if spec.shared[i] else data_dots[i] for i in moved]
+
+        def kernel(given: list[jax.Array], data_dots: list[jax.Array]) -> list[jax.Array]:
+            data, tangents = _split(spec, given)
+
+            def at(some: list[jax.Array]) -> list[jax.Array]:
+                new = list(data)
+                for i, value in zip(moved, some, strict=True):
+                    new[i] = value
+                return spec.kernel(new, tangents)
+
+            start = [jnp.broadcast_to(data[i], d.shape) for i, d in zip(moved, data_dots, strict=True)]
+            return jax.jvp(at, (start,), (data_dots,))[1]
+
+        shared = spec.shared + (False,) * len(tangents)
+        change = spec._replace(kernel=kernel, shared=shared, adjoint=None, rows=0)
+        parts.append(_bind(change, data + tangents, along))
+    return out, [sum(each[1:], each[0]) for each in zip(*parts, strict=True)]
+
+
+def _spread(leaf: jax.Array, lanes: int) -> jax.Array:
+    return jnp.broadcast_to(leaf, (lanes, *leaf.shape))
+
+
+def _transpose(cotangents: Any, *args: Any, spec: _Map) -> list:
+    data, tangents = _split(spec, args)
+    wanted = [i for i, ct in enumerate(cotangents) if type(ct) is not ad.Zero]
+    # The map is linear in all of its tangents together, so JAX asks for all of them at once.
+    avals = [t.aval for t in tangents]
+    if not wanted:
+        return [None] * len(data) + [ad.Zero(a) for a in avals]
+
+    def kernel(data: list[jax.Array], cotangents: list[jax.Array]) -> list[jax.Array]:
+        if spec.adjoint is not None:
+            every: list[jax.Array | None] = [None] * len(spec.outputs)
+            for i, cotangent in zip(wanted, cotangents, strict=True):
+                every[i] = cotangent
+            return spec.adjoint(data, every)
+        lanes = cotangents[0].shape[-1]
+        like = [jax.ShapeDtypeStruct((*a.shape[1:], lanes), a.dtype) for a in avals]
+
+        def part(tangents: list[jax.Array]) -> list[jax.Array]:
+            out = spec.kernel(data, tangents)
+            return [out[i] for i in wanted]
+
+        return jax.linear_transpose(part, like)(cotangents)[0]
+
+    rows = 0 if spec.adjoint is None else spec.rows
+    back = spec._replace(kernel=kernel, outputs=_events(avals), adjoint=None, rows=rows)
+    back = _bind(back, data, [cotangents[i] for i in wanted])
+    return [None] * len(data) + back
+
+
+def _batch(args: Any, dims: Any, *, spec: _Map) -> tuple[list, list]:
+    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
+    shared_args = spec.shared + (False,) * (len(args) - len(spec.shared))
+    mapped = [d is not None for d in dims]
+    front = [jnp.moveaxis(x, d, 0) if m else x for x, d, m in zip(args, dims, mapped, strict=True)]
+    lanes = next(x.shape[1 if m else 0] for x, m, s in zip(front, mapped, shared_args, strict=True) if not s)
+    merged, still = [], []
+    for x, m, s in zip(front, mapped, shared_args, strict=True):
+        still.append(s and not m)
+        if s and not m:
+            merged.append(x)
+            continue
+        if s:
+            x = jnp.broadcast_to(x[:, None], (size, lanes, *x.shape[1:]))
+        elif not m:
+            x = _spread(x, size)
+        merged.append(x.reshape(size * lanes, *x.shape[2:]))
+    out = _linear_lanes_p.bind(*merged, spec=spec._replace(shared=tuple(still[: len(spec.shared)])))
+    return [x.reshape(size, lanes, *x.shape[1:]) for x in out], [0] * len(out)
+
+
+ad.primitive_jvps[_linear_lanes_p] = _jvp
+ad.primitive_transposes[_linear_lanes_p] = _transpose
+batching.primitive_batchers[_linear_lanes_p] = _batch
