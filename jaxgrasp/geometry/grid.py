@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import safe_norm
+from jaxgrasp.arrays import fold, safe_norm
 from jaxgrasp.geometry.shape import Shape
 
 
@@ -65,20 +65,24 @@ class DistanceGrid(Shape):
 
     def distance(self, points: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
         """See `Shape.distance`. Off the grid, that at its nearest point plus the distance to that."""
-        shape = np.array(self.coefficients.shape)
+        counts = self.coefficients.shape
         places = (points - self.origin) / self.spacing
-        held = jnp.clip(places, jnp.asarray(0.5, places.dtype), jnp.asarray(shape - 1.5, places.dtype))
+        ends = jnp.asarray(np.array(counts) - 1.5, places.dtype)
+        held = jnp.clip(places, jnp.asarray(0.5, places.dtype), ends)
         # The gradient ends with the index: a spline's pieces are polynomials in what is left.
-        nearest = jnp.clip(jnp.round(lax.stop_gradient(held)).astype(jnp.int32), 1, jnp.asarray(shape - 2, jnp.int32))
-        rest = held - nearest.astype(held.dtype)
-        weights = jnp.stack([0.5 * (0.5 - rest) ** 2, 0.75 - rest**2, 0.5 * (0.5 + rest) ** 2], -1)
-        x, y, z = jnp.moveaxis(weights, -2, 0)
-        strides = np.array([shape[1] * shape[2], shape[2], 1], np.int32)
-        offsets = sum(np.arange(-1, 2, dtype=np.int32).reshape(-1, *[1] * (2 - i)) * strides[i] for i in range(3))
-        start = jnp.sum(nearest * jnp.asarray(strides), -1, dtype=jnp.int32)
-        window = self.coefficients.reshape(-1)[start[..., None, None, None] + jnp.asarray(offsets)]
-        value = jnp.sum(x[..., :, None, None] * y[..., None, :, None] * z[..., None, None, :] * window, (-3, -2, -1))
-        return value + safe_norm(places - held) * self.spacing
+        nearest = jnp.clip(jnp.round(lax.stop_gradient(held)).astype(jnp.int32), 1, jnp.array(counts, jnp.int32) - 2)
+        rest = jnp.moveaxis(held - nearest.astype(held.dtype), -1, 0)
+        weights = jnp.stack([0.5 * (0.5 - rest) ** 2, 0.75 - rest**2, 0.5 * (0.5 + rest) ** 2])
+        strides = (counts[1] * counts[2], counts[2], 1)
+        start = fold(jnp.add, [nearest[..., axis] * strides[axis] for axis in range(3)])
+        nodes = np.arange(-1, 2, dtype=np.int32)
+        offsets = nodes[:, None, None] * strides[0] + nodes[:, None] * strides[1] + nodes * strides[2]
+        offsets = jnp.asarray(offsets.reshape(3, 3, 3, *[1] * start.ndim), jnp.int32)
+        # Points trail: look-ups and sums over leading axes run in full vectors.
+        total = self.coefficients.reshape(-1).at[start + offsets].get(mode="promise_in_bounds")
+        for axis in (2, 1, 0):
+            total = fold(jnp.add, jnp.moveaxis(total, axis, 0) * weights[:, axis].reshape(3, *[1] * axis, *start.shape))
+        return total + safe_norm(places - held) * self.spacing
 
     @property
     def bounds(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
