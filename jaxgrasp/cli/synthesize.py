@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import tyro
-
 from jaxgrasp.cli.problems import CommandError, check_output
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
@@ -151,8 +149,8 @@ class Synthesize:
         points = np.asarray(geometry.sample_surface(grid, jax.random.key(self.seed), 4096))
         off = mesh.deviation(points) * 1e3
         note = (
-            f"{len(mesh.faces):,} triangles on a grid of {float(grid.spacing) * 1e3:.2f} mm; its surface is off theirs by "
-            f"{np.median(off):.3f} mm in the median, {off.max():.2f} mm at most"
+            f"{len(mesh.faces):,} triangles on a grid of {float(grid.spacing) * 1e3:.2f} mm; its surface is off theirs "
+            f"by {np.median(off):.3f} mm in the median, {off.max():.2f} mm at most"
         )
         return grid, mesh.centroid, path.stem, note
 

@@ -114,26 +114,28 @@ class Vertices:
         """A vertex, or the origin."""
         if directions.ndim > self.wrenches.ndim:
             return jnp.moveaxis(lax.map(self.furthest, jnp.moveaxis(directions, 1, 0)), 0, 1)
-        return jnp.stack(_furthest(self.wrenches, directions)[1])
+        return jnp.stack(_furthest(self.wrenches, directions, self.wrenches)[1])
 
     def extent(self) -> jax.Array:
         """Componentwise maximum."""
         return jnp.max(jnp.abs(self.wrenches), -2, initial=0)
 
 
-def _over_vertices(wrenches: jax.Array, row: jax.Array, raise_to: Callable, best: Tree) -> Tree:
-    """Fold `raise_to(best, some vertices)` over the vertices (directions, 6, *lanes), padded with the origin."""
-    count = wrenches.shape[0]
+def _over_vertices(vertices: Tree, row: jax.Array, raise_to: Callable, best: Tree) -> Tree:
+    """Fold `raise_to(best, some vertices)` over vertices, leaves (directions, 6, *lanes), padded with the origin."""
+    first, *_ = jax.tree.leaves(vertices)
+    count = first.shape[0]
     if count == 0:
         return best
-    chunk = min(count, _chunk(row, wrenches.shape[2:]))
+    chunk = min(count, _chunk(row, first.shape[2:]))
     chunks = -(-count // chunk)
-    padded = jnp.pad(wrenches, [(0, chunks * chunk - count)] + [(0, 0)] * (wrenches.ndim - 1))
+    extra = chunks * chunk - count
+    padded = jax.tree.map(lambda x: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)), vertices)
     if chunks == 1:
         return fenced(raise_to)(best, padded)
 
     def body(i: jax.Array, best: Tree) -> Tree:
-        return raise_to(best, lax.dynamic_slice_in_dim(padded, i * chunk, chunk))
+        return raise_to(best, jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, i * chunk, chunk), padded))
 
     return lax.fori_loop(0, chunks, body, best)
 
@@ -154,30 +156,30 @@ def _most(wrenches: jax.Array, directions: jax.Array) -> jax.Array:
 def _most_jvp(primals: tuple, tangents: tuple) -> tuple:
     """With w the vertex that a reaches furthest along: da'w + a'dw."""
     (wrenches, directions), (moved, turned) = primals, tangents
-    still = isinstance(moved, SymbolicZero)
-    reach, worst = _furthest(wrenches if still else jnp.concatenate([wrenches, moved], 1), directions)
+    reach, worst = _furthest(wrenches, directions, wrenches)
     change = jnp.zeros_like(reach)
     if not isinstance(turned, SymbolicZero):
-        change = change + fold(jnp.add, [w * a for w, a in zip(worst[:6], turned, strict=True)])
-    if not still:
-        change = change + fold(jnp.add, [w * a for w, a in zip(worst[6:], directions, strict=True)])
+        change = change + fold(jnp.add, [w * a for w, a in zip(worst, turned, strict=True)])
+    if not isinstance(moved, SymbolicZero):
+        _, dots = _furthest(wrenches, directions, moved)
+        change = change + fold(jnp.add, [w * a for w, a in zip(dots, directions, strict=True)])
     return reach, change
 
 
-def _furthest(wrenches: jax.Array, directions: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    """How far the vertices reach, and the one that does, whose components may be more than six."""
+def _furthest(wrenches: jax.Array, directions: jax.Array, marks: jax.Array) -> tuple[jax.Array, tuple]:
+    """How far the vertices reach, and of the one that does, for every direction, what `marks` has in its place."""
 
-    def raise_to(best: tuple, some: jax.Array) -> tuple:
-        for each_wrench in some:
+    def raise_to(best: tuple, some: tuple) -> tuple:
+        for own_wrench, mark in zip(*some, strict=True):
             reach, worst = best
-            own = _combine(each_wrench[:6], directions)
+            own = _combine(own_wrench, directions)
             further = own > reach
-            pairs = zip(each_wrench, worst, strict=True)
-            best = jnp.where(further, own, reach), tuple(jnp.where(further, _align(w, own), o) for w, o in pairs)
+            pairs = zip(mark, worst, strict=True)
+            best = jnp.where(further, own, reach), tuple(jnp.where(further, _align(m, own), o) for m, o in pairs)
         return best
 
     none = jnp.zeros_like(directions[0])
-    return _over_vertices(wrenches, none, raise_to, (none, (none,) * wrenches.shape[1]))
+    return _over_vertices((wrenches, marks), none, raise_to, (none, (none,) * 6))
 
 
 @jax.tree_util.register_dataclass

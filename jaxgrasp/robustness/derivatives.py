@@ -153,7 +153,7 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     """From cotangents of a central point to those of the data: one solve with the symmetric matrix."""
     program = scaled_program(grasps, cone_edges)
     problem, unit = _problem(grasps, program)
-    (group,), kappa = problem.groups, central_kappa(grasps, program)
+    (group,), kappa = problem.groups, central_kappa(grasps, program, unit)
     iterate = _iterate(problem, program, point, unit, kappa)
     (z,), (s,) = iterate.z, iterate.s
     forces = jnp.where(point.usable, point.forces, 0)
@@ -195,7 +195,8 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     if move_lambda is not None:
         reach = reach - z * (move_lambda * program.scale)
     force, move = jnp.moveaxis(forces, 1, 0), move_x * scales
-    y, move_y = (program.wrench_multipliers(v, jnp.ones_like(grasps.units)) for v in (iterate.y, move_y))
+    y = jnp.where(point.usable, point.wrench_multipliers, 0) / grasps.units / unit
+    move_y = program.wrench_multipliers(move_y, jnp.ones_like(grasps.units))
     normal = literal(pyramid_facets(cone_edges)[:, 2], z.dtype)[:, None, None]
     asked = None
     if grasps.margin is not None:
@@ -218,17 +219,17 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     return _to_grasps(grasps, rows, cone_edges, names)
 
 
-def central_kappa(grasps: Grasps, program: Program) -> jax.Array:
-    """What s z is at the central point, scaled, (*lanes)."""
+def central_kappa(grasps: Grasps, program: Program, unit: jax.Array) -> jax.Array:
+    """What s z is at the central point, scaled, (*lanes), for an objective in the given unit."""
     if grasps.smoothing is not None:
-        return grasps.smoothing / program.scale
+        return grasps.smoothing / unit
     return jnp.full_like(program.scale, _KAPPA[program.scale.dtype.name])
 
 
 def centred(grasps: Grasps, program: Program, start: Iterate, active: jax.Array) -> Point:
     """The central point that Newton's method finds from a start near by."""
     problem, unit = _problem(grasps, program)
-    kappa = central_kappa(grasps, program)
+    kappa = central_kappa(grasps, program, unit)
     centre = central_point(problem, start, kappa, active)
     found = active & (centre.error <= _FOUND[kappa.dtype.name])
     return _point(grasps, program, centre.iterate, unit, found)

@@ -119,8 +119,8 @@ def least_effort(
             identity.
         cone_edges: n_e.
         cone_margin: d (*batch,), N, >= 0.
-        smoothing: kappa (*batch,), > 0, in units of the margin, as in `largest_disturbance`: s z = kappa / Lambda with
-            s and z scaled by max_force and Lambda the margin's natural scale. None is the exact optimum.
+        smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the
+            effort, this program's objective. None is the exact optimum.
 
     Returns:
         Solution; `margin` is what `forces` certify, at least the one asked for up to rounding, `upper_bound` that of
@@ -190,7 +190,7 @@ class _LargestDisturbance(_Tightening):
 
 class _LeastEffort(_Tightening):
     def _solve(self, grasps: Grasps, program: Program) -> Solution:
-        return _solve_effort(grasps, program, *_solve_margin(grasps, program))
+        return _solve_effort(grasps, program, *_solve_margin(replace(grasps, smoothing=None), program))
 
     def tangents(self, along: Along, out: Solution) -> Solution:
         return _changed(out, self._central(along, _point_of(out, jnp.isfinite(out.effort))))
@@ -210,7 +210,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     """(21) for lanes; also the scaled record, from which (22) starts."""
     dtype = program.rhs.dtype
     problem = margin_problem(program)
-    settings, slack = _towards_centre(_SETTINGS[dtype.name], grasps, program)
+    settings, slack = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     # Without a load, no forces at all are an answer with margin 0, exactly.
     idle = (outcome.record.lower < 0) & (program.rhs == 0).all(0) & (grasps.reserve == 0)
@@ -268,11 +268,13 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     return _at_centre(grasps, program, outcome.iterate, solution), record
 
 
-def _towards_centre(settings: Settings, grasps: Grasps, program: Program) -> tuple[Settings, jax.Array | float]:
+def _towards_centre(
+    settings: Settings, grasps: Grasps, program: Program, unit: jax.Array
+) -> tuple[Settings, jax.Array | float]:
     """Where smoothing is asked for, the loop aims at the central point, whose gap is kappa for every row."""
     if grasps.smoothing is None:
         return settings, 0.0
-    kappa = central_kappa(grasps, program)
+    kappa = central_kappa(grasps, program, unit)
     gap = 2 * kappa * program.sigma.shape[0] * fold(jnp.add, grasps.present)
     return settings._replace(tolerance=jnp.maximum(settings.tolerance, gap), mu_floor=kappa), gap
 
@@ -293,8 +295,8 @@ def _largest(rows: tuple) -> jax.Array:
 def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Record) -> Solution:
     """(22) for lanes, from what (21) left."""
     dtype, blocks = program.rhs.dtype, program.blocks
-    settings, slack = _towards_centre(_EFFORT_SETTINGS[dtype.name], grasps, program)
     problem, wanted, unit = effort_problem(grasps, program)
+    settings, slack = _towards_centre(_EFFORT_SETTINGS[dtype.name], grasps, program, unit**2)
     reachable = grasps.margin <= first.upper_bound * (1 + settings.tolerance)
     held = (reachable & jnp.isfinite(record.lower)) | program.undisturbed
 

@@ -51,13 +51,20 @@ class Program(NamedTuple):
     h: jax.Array
 
 
-class _Factors(NamedTuple):
-    """Inverse triangular factors of P + G'WG and of the equalities' Schur complement; the solution for (-q, b, h)."""
+class Factors(NamedTuple):
+    """Inverse triangular factors of P + G'WG and of the equalities' Schur complement."""
 
     inverse: jax.Array
     reduced: jax.Array
     schur: jax.Array
     weights: jax.Array
+
+
+class _Newton(NamedTuple):
+    """Factors, the weight of tau's row, and the solution for (-q, b, h), by which the others move with tau."""
+
+    factors: Factors
+    weight: jax.Array
     ray: tuple[jax.Array, jax.Array, jax.Array]
 
 
@@ -98,16 +105,20 @@ class Embedding:
         rows = s + jnp.append(G @ x - h * tau, balance)
         return Residuals((P @ x + A.T @ y + G.T @ z + q * tau, iterate), A @ x - b * tau, rows)
 
-    def factor(self, weights: jax.Array) -> _Factors:
-        """Factors of P + G'WG and of A (P + G'WG)^-1 A', both regularised."""
+    def factor(self, weights: jax.Array) -> _Newton:
+        """See `interior_point.Problem`."""
+        factors, (_, q, _, b, _, h) = self.reduce(weights[:-1]), self.program
+        return _Newton(factors, weights[-1], self.newton(factors, (-q, b, h)))
+
+    def reduce(self, weights: jax.Array) -> Factors:
+        """Factors of P + G'WG and of A (P + G'WG)^-1 A', both regularised, for weights (m,)."""
         # An orthogonal factor of P + G'WG: forming that matrix would lose half the digits, in float32 all that count.
-        P, q, A, b, G, h = self.program
+        _, _, A, b, G, _ = self.program
         small = jnp.sqrt(self.constants.regularisation)
-        inverse = _inverse_factor(jnp.concatenate([jnp.sqrt(weights[:-1, None]) * G, self.root]))
+        inverse = _inverse_factor(jnp.concatenate([jnp.sqrt(weights[:, None]) * G, self.root]))
         reduced = inverse.T @ A.T
         schur = _inverse_factor(jnp.concatenate([reduced, small * jnp.eye(b.size, dtype=b.dtype)]))
-        factors = _Factors(inverse, reduced, schur, weights, (q, b, h))
-        return factors._replace(ray=self._newton(factors, (-q, b, h)))
+        return Factors(inverse, reduced, schur, weights)
 
     @cached_property
     def root(self) -> jax.Array:
@@ -115,10 +126,10 @@ class Embedding:
         P, small = self.program.P, self.constants.regularisation
         return jnp.linalg.cholesky(P + small * jnp.eye(P.shape[0], dtype=P.dtype)).T
 
-    def _newton(self, factors: _Factors, right: tuple) -> tuple:
+    def newton(self, factors: Factors, right: tuple) -> tuple:
         """Solve P x + A'y + G'z = r1, A x = r2, G x - z/w = r3; refinement also takes back the regularisation."""
         P, _, A, _, G, _ = self.program
-        inverse, reduced, schur, w = factors.inverse, factors.reduced, factors.schur, factors.weights[:-1]
+        inverse, reduced, schur, w = factors.inverse, factors.reduced, factors.schur, factors.weights
 
         def refine(_: int, solution: tuple) -> tuple:
             x, y, z = solution
@@ -130,11 +141,11 @@ class Embedding:
 
         return lax.fori_loop(0, 1 + _REFINEMENTS, refine, tuple(map(jnp.zeros_like, right)))
 
-    def solve(self, factors: _Factors, residuals: Residuals, shift: jax.Array) -> tuple:
+    def solve(self, factors: _Newton, residuals: Residuals, shift: jax.Array) -> tuple:
         """The Newton step of the embedding, tau eliminated last."""
         P, q, A, b, G, h = self.program
         lacking, (x, _, s, z) = residuals.dual
-        weights = factors.weights
+        weights = jnp.append(factors.factors.weights, factors.weight)
         # Homogeneous residuals can only vanish together with s'z, so they are made to fall in the same proportion.
         # A row's shift tells the loop's aim but for a second-order term, small in most rows: hence the median.
         aim = jnp.median(s * (shift + z - weights * residuals.rows))
@@ -142,7 +153,7 @@ class Embedding:
         lag = (1 - share) * residuals.rows
         w, tau = weights[:-1], z[-1]
         right = (-share * lacking, -share * residuals.primal, lag[:-1] - shift[:-1] / w)
-        dx, dy, dz = self._newton(factors, right)
+        dx, dy, dz = self.newton(factors.factors, right)
         at, (x1, y1, z1) = x / tau, factors.ray
         slope = 2 * (P @ at) + q
         bend = (x1 - at) @ P @ (x1 - at) + z1 @ (z1 / w)
