@@ -162,7 +162,9 @@ def _step(state: State, task: Task, number: Array, key: PRNGKeyArray, cone_edges
         best_margin=jnp.where(better, margin, state.best_margin),
         restarts=state.restarts,
     )
-    direction, momentum = jax.vmap(_ADAM.update)(slope, state.momentum)
+    # Optax raises floats to integer powers, which users of strict promotion have forbidden.
+    with jax.numpy_dtype_promotion("standard"):
+        direction, momentum = jax.vmap(_ADAM.update)(slope, state.momentum)
     length = task.size * (_LAST_STEP + _FIRST_STEP * 0.5 * (1 + jnp.cos(jnp.pi * done)))
     move = length * direction
     move = move - outward * jnp.sum(move * outward, -1, keepdims=True)

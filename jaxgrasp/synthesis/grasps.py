@@ -125,13 +125,15 @@ def synthesize(
             raise ValueError(f"{name}: got {got}, wanted {wanted}")
     centre = centroid(shape) if center_of_mass is None else as_float("center_of_mass", center_of_mass, (3,))
     lower, upper = shape.bounds
+    size = 0.5 * jnp.linalg.norm(upper - lower)
+    slack = TOLERANCE * size
     exact = Task(
-        placing=Placing(shape=shape, spacing=jnp.asarray(spacing, float), span=jnp.asarray(span, float)),
+        placing=Placing(shape=shape, spacing=jnp.asarray(spacing, float), span=jnp.asarray(span, float), slack=slack),
         disturbances=disturbances,
         friction=jnp.asarray(friction, float),
         max_force=jnp.asarray(max_force, float),
         center_of_mass=centre,
-        size=0.5 * jnp.linalg.norm(upper - lower),
+        size=size,
         steps=jnp.asarray(steps, float),
     )
     exact = _in(jnp.result_type(float), exact)
