@@ -7,6 +7,7 @@ import tyro
 
 from jaxgrasp.cli.problems import CommandError
 from jaxgrasp.cli.rank import Rank
+from jaxgrasp.cli.synthesize import Synthesize
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         1 where the computation itself failed.
     """
     command = tyro.extras.subcommand_cli_from_dict(
-        {"rank": Rank},
+        {"rank": Rank, "synthesize": Synthesize},
         prog="jaxgrasp",
         description="Robustness of multi-fingered grasps, in batch.",
         args=arguments,
@@ -31,5 +32,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxgrasp: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("jaxgrasp: interrupted, nothing was ranked", file=sys.stderr)
+        print("jaxgrasp: interrupted, nothing was written", file=sys.stderr)
         return 130

@@ -1,7 +1,6 @@
 """`jaxgrasp rank`: files of candidates in, a table and a figure out."""
 
 import math
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +9,13 @@ from typing import TYPE_CHECKING
 import tyro
 
 from jaxgrasp.cli.problems import CommandError, check_output
+from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.disturbance import DisturbanceSet
     from jaxgrasp.ranking import Ranking
 
-FIGURE_ENDINGS = (".png", ".svg", ".pdf")
-BOX = (1.0, 1.0, 1.0, 0.02, 0.02, 0.02)
 SAMPLED = 10_000
 
 
@@ -73,12 +71,12 @@ class Rank:
             CommandError: The options or the files cannot be used.
         """
         self._check()
-        _configure_jax()
+        configure_jax()
         from jaxgrasp.candidates import CandidateError
 
         try:
             candidates = self._candidates()
-            disturbances, unit = self._disturbances()
+            disturbances, unit = named_disturbances(self.disturbances)
         except CandidateError as error:
             raise CommandError(str(error)) from error
         return self._rank(candidates, disturbances, unit)
@@ -117,20 +115,6 @@ class Rank:
             friction=0.6 if self.friction is None else self.friction,
             max_force=10.0 if self.max_force is None else self.max_force,
         )
-
-    def _disturbances(self) -> "tuple[DisturbanceSet, str]":
-        import jax.numpy as jnp
-
-        from jaxgrasp.candidates import read_wrenches
-        from jaxgrasp.disturbance import DisturbanceSet
-
-        if self.disturbances == "forces":
-            return DisturbanceSet.forces(1.0), "N"
-        if self.disturbances == "ball":
-            return DisturbanceSet.ball(force=1.0), "N"
-        if self.disturbances == "box":
-            return DisturbanceSet.box(jnp.array(BOX)), "boxes"
-        return DisturbanceSet.vertices(jnp.asarray(read_wrenches(self.disturbances))), "times the file's"
 
     def _rank(self, candidates: "Candidates", disturbances: "DisturbanceSet", unit: str) -> int:
         from jaxgrasp.cli.report import Clock, print_ranking, progress_bar
@@ -181,15 +165,3 @@ class Rank:
                 print(f"jaxgrasp: {path}: cannot be written ({error.strerror or error})", file=sys.stderr)
                 failed = True
         return written, failed
-
-
-def _configure_jax() -> None:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    try:
-        # One program runs on one core; as many devices as cores make a tile run on all of them.
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-    except RuntimeError:
-        # Whoever calls the command from a program of their own has started JAX already: its devices stay as they are.
-        pass

@@ -1,4 +1,4 @@
-"""What a ranking prints: its best, a count of every status, how fast it went and what was written."""
+"""What the subcommands print: progress, tables, how fast it went and what was written."""
 
 import contextlib
 import sys
@@ -14,6 +14,7 @@ from rich.table import Table
 
 from jaxgrasp.ranking import Ranking
 from jaxgrasp.solvers.status import Status
+from jaxgrasp.synthesis import Record, Synthesis
 
 _ROWS = 20
 _TEXT_COLUMNS = 2
@@ -62,6 +63,53 @@ def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
             progress.update(task, completed=done, description="ranking" if done < total else "tightening")
 
         yield show
+
+
+@contextlib.contextmanager
+def ascent_bar(steps: int) -> Iterator[Callable[[int, Record], None]]:
+    """Shows a bar on standard error where that is a terminal, with the median and the best margin so far.
+
+    Args:
+        steps: How many steps there are.
+
+    Yields:
+        What to call with the number of steps done and the record.
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("compiling", total=steps)
+
+        def show(done: int, record: Record) -> None:
+            text = f"margin: median {record.median[-1]:.3g}, best {record.best[-1]:.3g}"
+            progress.update(task, completed=done, description=text)
+
+        yield show
+
+
+def print_synthesis(found: Synthesis, name: str, note: str, unit: str, written: Sequence[Path]) -> None:
+    """Prints what a synthesis found to standard output.
+
+    Args:
+        found: The grasps.
+        name: The object's name.
+        note: What else is to be said of the object; empty for nothing.
+        unit: Unit of the margin.
+        written: The files that were written.
+    """
+    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
+    if note:
+        console.print(f"{name}: {note}", markup=False)
+    table = Table(title=f"{len(found.margin):,} grasps of {escape(name)} with {found.positions.shape[1]} contacts")
+    for column in (f"margin [{unit}]", "lowest tenth", "median", "best", "above zero"):
+        table.add_column(escape(column), justify="left" if "margin" in column else "right")
+    for label, margin in (("random starts", found.first_margin), ("synthesised", found.margin)):
+        known = np.nan_to_num(margin, nan=0.0)
+        low, middle, best = np.quantile(known, (0.1, 0.5, 1.0))
+        table.add_row(label, f"{low:.4g}", f"{middle:.4g}", f"{best:.4g}", f"{(known > 1e-4).mean():.1%}")
+    console.print(table)
+    if written:
+        console.print("written: " + ", ".join(map(str, written)), markup=False)
 
 
 def print_ranking(ranking: Ranking, unit: str, clock: Clock, written: Sequence[Path]) -> None:

@@ -2,5 +2,6 @@
 
 from jaxgrasp.viewer.grasp import draw_grasp
 from jaxgrasp.viewer.ranking import figure_of_ranking, write_figure
+from jaxgrasp.viewer.synthesis import figure_of_synthesis
 
-__all__ = ["draw_grasp", "figure_of_ranking", "write_figure"]
+__all__ = ["draw_grasp", "figure_of_ranking", "figure_of_synthesis", "write_figure"]

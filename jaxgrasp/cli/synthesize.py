@@ -1,0 +1,216 @@
+"""`jaxgrasp synthesize`: an object in, a file of candidates and a figure out."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxgrasp.cli.problems import CommandError, check_output
+from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxgrasp.geometry import Shape
+    from jaxgrasp.synthesis import Synthesis
+
+BUILT_IN = ("sphere", "ellipsoid", "box", "capsule", "cylinder", "superquadric")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthesize:
+    """Make grasps of an object by gradient ascent on the largest disturbance that they resist.
+
+    Contacts begin at random places on the surface and move along it. Writes an .npz file of candidates that `jaxgrasp
+    rank` reads: positions about the centre of mass, outward_normals, friction, max_force, the best first.
+    """
+
+    object: str = "superquadric"
+    """sphere, ellipsoid, box, capsule, cylinder or superquadric; or a mesh FILE, .stl, .obj or .ply."""
+
+    size: float = 0.1
+    """Longest side of a built-in object, m."""
+
+    scale: float = 1.0
+    """Metres per unit of the mesh file."""
+
+    contacts: int = 4
+    """Contacts of each grasp."""
+
+    friction: float = 0.6
+    """Coulomb's friction coefficient."""
+
+    max_force: float = 10.0
+    """Largest normal force, N."""
+
+    disturbances: str = "box"
+    """forces: 1 N along the six axes; ball: 1 N in any direction; box: 1 N along each axis together with 0.02 N m about
+    each; or a FILE of wrenches, .npy or .npz with the field wrenches (n_d, 6), N and N m. The margin is the factor by
+    which they may grow."""
+
+    spacing: float = 0.015
+    """Least distance of two contacts on the same side of the object, m."""
+
+    span: float | None = None
+    """Largest distance of any two contacts, m; None for no limit."""
+
+    starts: int = 1024
+    """How many random starts."""
+
+    steps: int = 200
+    """Steps of the ascent."""
+
+    seed: int = 0
+    """Seed of the random numbers."""
+
+    cone_edges: int = 8
+    """Edges of the friction pyramid."""
+
+    output: Path = Path("grasps.npz")
+    """The file of candidates to write, .npz."""
+
+    figure: Path | None = Path("synthesis.png")
+    """The figure to write, .png, .svg or .pdf; None for no figure."""
+
+    def run(self) -> int:
+        """Synthesises, writes and prints.
+
+        Returns:
+            The exit code: 0, or 2 where a file could not be written in the end.
+
+        Raises:
+            CommandError: The options or the files cannot be used.
+        """
+        self._check()
+        configure_jax()
+        from jaxgrasp.candidates import CandidateError
+        from jaxgrasp.geometry import MeshError
+
+        try:
+            shape, centre, name, note = self._object()
+            disturbances, unit = named_disturbances(self.disturbances)
+        except (MeshError, CandidateError) as error:
+            raise CommandError(str(error)) from error
+        found = self._synthesize(shape, centre, disturbances)
+        from jaxgrasp.cli.report import print_synthesis
+
+        written = self._write(found, shape, name, unit)
+        print_synthesis(found, name, note, unit, written)
+        return 0 if len(written) == 1 + (self.figure is not None) else 2
+
+    def _check(self) -> None:
+        span = math.inf if self.span is None else self.span
+        checks = [
+            ("--size", self.size, 0.0 < self.size < math.inf, "metres > 0"),
+            ("--scale", self.scale, 0.0 < self.scale < math.inf, "a number > 0"),
+            ("--contacts", self.contacts, self.contacts >= 2, "at least 2"),
+            ("--friction", self.friction, 0.0 < self.friction < math.inf, "a number > 0"),
+            ("--max-force", self.max_force, 0.0 < self.max_force < math.inf, "newtons > 0"),
+            ("--spacing", self.spacing, 0.0 <= self.spacing < math.inf, "metres >= 0"),
+            ("--span", self.span, span > self.spacing, "metres above --spacing"),
+            ("--starts", self.starts, self.starts >= 1, "at least 1"),
+            ("--steps", self.steps, self.steps >= 1, "at least 1"),
+            ("--seed", self.seed, 0 <= self.seed < 2**32, "from 0 to 2^32 - 1"),
+            ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
+        ]
+        for option, value, admissible, wanted in checks:
+            if not admissible:
+                raise CommandError(f"{option}: got {value}; wanted {wanted}")
+        inputs = [Path(self.object), Path(self.disturbances)]
+        check_output(self.output, "--output", (".npz",), inputs)
+        if self.figure is not None:
+            check_output(self.figure, "--figure", FIGURE_ENDINGS, inputs)
+
+    def _object(self) -> "tuple[Shape, Any, str, str]":
+        """The shape, its centre of mass, its name, and what the conversion of a mesh cost."""
+        import numpy as np
+
+        from jaxgrasp import geometry
+
+        half = 0.5 * self.size
+        sides = half * np.array([0.6, 0.45, 1.0])
+        built_in = {
+            "sphere": lambda: geometry.Sphere.from_radius(half),
+            "ellipsoid": lambda: geometry.Ellipsoid.from_semi_axes(sides),
+            "box": lambda: geometry.Box.from_half_extents(sides, rounding=0.1 * half),
+            "capsule": lambda: geometry.Capsule.from_radius(0.4 * half, 0.6 * half),
+            "cylinder": lambda: geometry.Cylinder.from_radius(0.6 * half, half, rounding=0.1 * half),
+            "superquadric": lambda: geometry.Superquadric.from_semi_axes(sides),
+        }
+        if self.object in built_in:
+            return built_in[self.object](), np.zeros(3), self.object, ""
+        path = Path(self.object)
+        if not path.suffix:
+            raise CommandError(f"--object: got {self.object!r}; wanted {', '.join(BUILT_IN)}, or a mesh file")
+        import jax
+
+        mesh = geometry.Mesh.from_file(path, self.scale)
+        grid = mesh.to_grid()
+        points = np.asarray(geometry.sample_surface(grid, jax.random.key(self.seed), 4096))
+        off = mesh.deviation(points) * 1e3
+        note = (
+            f"{len(mesh.faces):,} triangles on a grid of {float(grid.spacing) * 1e3:.2f} mm; its surface is off theirs "
+            f"by {np.median(off):.3f} mm in the median, {off.max():.2f} mm at most"
+        )
+        return grid, mesh.centroid, path.stem, note
+
+    def _synthesize(self, shape: "Shape", centre: "np.ndarray", disturbances: Any) -> "Synthesis":
+        import jax
+
+        from jaxgrasp.cli.report import ascent_bar
+        from jaxgrasp.synthesis import synthesize
+
+        with ascent_bar(self.steps) as progress:
+            return synthesize(
+                shape,
+                self.contacts,
+                jax.random.key(self.seed),
+                disturbances=disturbances,
+                friction=self.friction,
+                max_force=self.max_force,
+                starts=self.starts,
+                steps=self.steps,
+                spacing=self.spacing,
+                span=math.inf if self.span is None else self.span,
+                center_of_mass=centre,
+                cone_edges=self.cone_edges,
+                progress=progress,
+            )
+
+    def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> list[Path]:
+        import sys
+
+        import jax
+        import numpy as np
+
+        from jaxgrasp.geometry import sample_surface
+        from jaxgrasp.viewer import figure_of_synthesis, write_figure
+
+        count = len(found.margin)
+        surface = np.asarray(sample_surface(shape, jax.random.key(self.seed), 1500)) - found.center_of_mass
+
+        def write_candidates(path: Path) -> None:
+            np.savez(
+                path,
+                positions=found.positions,
+                outward_normals=found.outward_normals,
+                friction=np.full(count, self.friction),
+                max_force=np.full(count, self.max_force),
+                center_of_mass=np.broadcast_to(found.center_of_mass, (count, 3)),
+                object_name=np.full(count, name),
+                synthesis_margin=found.margin,
+            )
+
+        def write_picture(path: Path) -> None:
+            write_figure(figure_of_synthesis(found, surface, friction=self.friction, name=name, unit=unit), path)
+
+        written = []
+        for path, write in ((self.output, write_candidates), (self.figure, write_picture)):
+            if path is None:
+                continue
+            try:
+                write(path)
+                written.append(path)
+            except OSError as error:
+                print(f"jaxgrasp: {path}: cannot be written ({error.strerror or error})", file=sys.stderr)
+        return written

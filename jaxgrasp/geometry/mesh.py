@@ -1,0 +1,166 @@
+"""Triangle meshes from files, and the grids of their signed distances."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxgrasp.geometry.grid import DistanceGrid
+from jaxgrasp.geometry.triangles import signed_distances
+
+MESH_ENDINGS = (".stl", ".obj", ".ply")
+# Nodes beyond the mesh on every side: the spline's support, and room for points on their way back to the surface.
+_MARGIN = 4
+# Nodes nearer to the surface than 1.5 sqrt(3) spacings take part in look-ups on it; the rest is for those beside it.
+_BAND = 3.5
+# What trimesh's readers raise for damaged files; for noise in place of text, that a guesser of encodings is missing.
+_BROKEN = (ValueError, TypeError, LookupError, AttributeError, EOFError, OSError, MemoryError, ImportError)
+
+
+class MeshError(ValueError):
+    """A mesh cannot be used. The message is one line: file, what came, what is wanted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """Triangles, counterclockwise seen from outside, in NumPy."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    """m."""
+    faces: Int[np.ndarray, "triangles 3"]
+    """Indices of the corners."""
+
+    @classmethod
+    def from_arrays(cls, vertices: np.ndarray, faces: np.ndarray) -> "Mesh":
+        """A mesh of given triangles.
+
+        Args:
+            vertices: (vertices, 3), m.
+            faces: (triangles, 3), indices.
+
+        Raises:
+            MeshError: not a mesh: other shapes, nothing in it, not finite, indices out of range, or flat.
+        """
+        vertices, faces = np.asarray(vertices, float), np.asarray(faces)
+        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
+            raise MeshError(f"got vertices {vertices.shape} and faces {faces.shape}, wanted (V, 3) and (F, 3)")
+        if len(faces) == 0:
+            raise MeshError("got no triangles, wanted a surface")
+        if faces.dtype.kind not in "iu" or faces.min() < 0 or faces.max() >= len(vertices):
+            raise MeshError(f"got faces that are no indices of the {len(vertices)} vertices, wanted 0 to V - 1")
+        if not np.isfinite(vertices).all():
+            raise MeshError("got vertices that are not finite, wanted finite ones")
+        mesh = cls(vertices=vertices, faces=faces)
+        if not abs(mesh.volume) > 1e-9 * np.ptp(mesh.triangles, axis=(0, 1)).max() ** 3:
+            raise MeshError(f"got a surface around {mesh.volume:.3g} m^3, wanted one around a solid")
+        # Some programs write the corners clockwise.
+        return mesh if mesh.volume > 0 else cls(vertices=vertices, faces=faces[:, ::-1])
+
+    @classmethod
+    def from_file(cls, path: Path | str, scale: float = 1.0) -> "Mesh":
+        """Reads a mesh, `.stl`, `.obj` or `.ply`; all its parts become one.
+
+        Args:
+            path: the file.
+            scale: metres per unit of the file.
+
+        Raises:
+            MeshError: absent, of another kind, damaged, or not a mesh.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in MESH_ENDINGS:
+            raise MeshError(f"{path}: got the ending {path.suffix!r}, wanted one of {', '.join(MESH_ENDINGS)}")
+        # Two seconds that those who need no files do not wait for.
+        import trimesh
+
+        try:
+            with path.open("rb") as stream:
+                found = trimesh.load_mesh(stream, file_type=path.suffix[1:].lower(), process=True)
+            return cls.from_arrays(scale * np.asarray(found.vertices), np.asarray(found.faces))
+        except MeshError as error:
+            raise MeshError(f"{path}: {error}") from None
+        except _BROKEN as error:
+            reason = error.strerror.lower() if isinstance(error, OSError) and error.strerror else "damaged data"
+            raise MeshError(f"{path}: got {reason}, wanted an intact mesh") from error
+
+    @property
+    def triangles(self) -> Float[np.ndarray, "triangles 3 3"]:
+        """Corners of the triangles, m."""
+        return self.vertices[self.faces]
+
+    @property
+    def volume(self) -> float:
+        """Of the solid inside, m^3; negative where the triangles are clockwise."""
+        return float(self._tetrahedra()[0].sum())
+
+    @property
+    def centroid(self) -> Float[np.ndarray, "3"]:
+        """Centre of the solid's volume, its centre of mass where it is of one material, m."""
+        volumes, centres = self._tetrahedra()
+        return volumes @ centres / volumes.sum()
+
+    def signed_distance(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
+        """Exact signed distances to all triangles, see `triangles.signed_distances`."""
+        return signed_distances(self.triangles, np.asarray(points, float))
+
+    def to_grid(self, nodes: int = 200_000) -> DistanceGrid:
+        """The mesh as a shape: its signed distances on a grid, smoothly interpolated.
+
+        Args:
+            nodes: how many nodes the grid may have; what is thinner than two of its spacings is lost.
+
+        Raises:
+            ValueError: fewer than 1,000 nodes.
+        """
+        if nodes < 1000:
+            raise ValueError(f"nodes: got {nodes}, wanted at least 1000")
+        corners = self.triangles.reshape(-1, 3)
+        lower, upper = corners.min(0), corners.max(0)
+        spacing = _spacing(upper - lower, nodes)
+        counts = 2 * (np.floor((upper - lower) / spacing).astype(int) // 2 + _MARGIN) + 1
+        origin = 0.5 * (lower + upper - spacing * (counts - 1))
+        values = self._samples(origin, spacing, counts)
+        return DistanceGrid.from_samples(values, origin=origin, spacing=spacing, lower=lower, upper=upper)
+
+    def deviation(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
+        """How far points that should lie on the surface are off it, m."""
+        return np.abs(self.signed_distance(points))
+
+    def _samples(self, origin: np.ndarray, spacing: float, counts: np.ndarray) -> np.ndarray:
+        """Signed distances at the nodes of a grid: exact near the surface, elsewhere between those of every other node.
+
+        The counts are odd.
+        """
+        indices = np.indices(counts)
+        even = (indices % 2 == 0).all(0)
+
+        def exact(where: np.ndarray) -> np.ndarray:
+            return self.signed_distance(origin + spacing * indices[:, where].T)
+
+        values = exact(even).reshape(counts // 2 + 1)
+        for axis in range(3):
+            ahead = np.moveaxis(values, axis, 0)
+            finer = np.empty((2 * len(ahead) - 1, *ahead.shape[1:]))
+            finer[::2], finer[1::2] = ahead, 0.5 * (ahead[:-1] + ahead[1:])
+            values = np.moveaxis(finer, 0, axis)
+        near = ~even & (np.abs(values) < _BAND * spacing)
+        values[near] = exact(near)
+        return values
+
+    def _tetrahedra(self) -> tuple[np.ndarray, np.ndarray]:
+        """Signed volumes and centres of the tetrahedra between the triangles and a point amid them."""
+        amid = self.vertices[self.faces].mean((0, 1))
+        corners = self.triangles - amid
+        volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+        return volumes, corners.sum(1) / 4 + amid
+
+
+def _spacing(extents: np.ndarray, nodes: int) -> float:
+    """The spacing with which a grid around a box of these extents has about so many nodes."""
+    low, high = 0.0, float(extents.max())
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        fits = np.prod(extents / middle + 2 * _MARGIN) <= nodes
+        low, high = (low, middle) if fits else (middle, high)
+    return high
