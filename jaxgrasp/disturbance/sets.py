@@ -1,6 +1,6 @@
 """Disturbance sets and their Minkowski sums."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
-from jaxgrasp.disturbance.terms import Ball, Box, Ellipsoid, Term, Vertices
+from jaxgrasp.disturbance.terms import Ball, Box, Ellipsoid, Term
+from jaxgrasp.disturbance.vertices import Vertices
 
 
 @jax.tree_util.register_dataclass
@@ -101,6 +102,19 @@ class DisturbanceSet:
         """
         turn = as_float("rotation", rotation, (3, 3))
         return DisturbanceSet(terms=tuple(term.rotated(turn) for term in self.terms))
+
+    def smoothed(self, width: ArrayLike) -> "DisturbanceSet":
+        """The same set with a smooth worst case, for optimisers that stumble over the edges of S_1 and S_2.
+
+        Support functions become smooth upper bounds, so what is certified for the result holds for the set itself:
+        log-sum-exp over vertices, too large by at most width log(1 + n_d), and sqrt(x^2 + width^2) in place of |x| for
+        boxes (six times), balls (twice) and ellipsoids, each too large by at most the width.
+
+        Args:
+            width: (*batch,), N, > 0: small against what the disturbances cost a contact, the entries of S_1 and S_2.
+        """
+        given = as_float("width", width, ())
+        return DisturbanceSet(terms=tuple(replace(term, width=given) for term in self.terms))
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -14,7 +14,8 @@ from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.disturbance.terms import Term, Vertices
+from jaxgrasp.disturbance.terms import Term
+from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
 
 
