@@ -90,9 +90,11 @@ def frames_from_normals(normals: jax.Array) -> jax.Array:
     """
     largest = jnp.max(jnp.abs(normals), -1, keepdims=True)
     usable = (largest > 0) & jnp.isfinite(largest)
+    # Others become z, and NaN at the end alone: derivatives would carry it to everything.
+    safe = jnp.where(usable, normals, jnp.array([0, 0, 1], normals.dtype))
     # Dividing by the largest entry first keeps tiny and huge normals from under- and overflowing.
-    scaled = normals / jnp.where(usable, largest, 1)
-    n = jnp.where(usable, scaled / jnp.where(usable, safe_norm(scaled)[..., None], 1), jnp.nan)
+    scaled = safe / jax.lax.stop_gradient(jnp.where(usable, largest, 1))
+    n = scaled / safe_norm(scaled)[..., None]
     x, y, z = n[..., 0], n[..., 1], n[..., 2]
     # 1 / (1 + z), without cancellation where z is near -1.
     upper = z >= 0
@@ -102,7 +104,7 @@ def frames_from_normals(normals: jax.Array) -> jax.Array:
     t1 = jnp.stack([jnp.where(down, -1, 1 - x * x * inverse), -x * y * inverse, -x], -1)
     t2 = jnp.stack([-x * y * inverse, 1 - y * y * inverse, -y], -1)
     frames = jnp.stack([t1, t2, n], -1)
-    return jnp.where(jnp.isfinite(n)[..., None, :].all(-1, keepdims=True), frames, jnp.nan)
+    return jnp.where(usable[..., None], frames, jnp.nan)
 
 
 def fold(op: Callable[[jax.Array, jax.Array], jax.Array], parts: Iterable[jax.Array]) -> jax.Array:

@@ -79,7 +79,14 @@ def largest_disturbance(
 
     Status:
         SOLVED; INFEASIBLE (b cannot be borne); UNBOUNDED (nothing disturbs, margin inf); INVALID_INPUT (data not
-        admissible, for that grasp alone); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot tell).
+        admissible, for that grasp alone); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot tell). With smoothing, SOLVED
+        means that the central point was found; its margin may be negative, which then proves nothing.
+
+    Derivatives:
+        Of margin (and upper_bound), forces, effort and multipliers with respect to everything that is continuous, of
+        any order. The exact margin's gradient is that of the Lagrangian (envelope theorem), at kinks a subgradient;
+        that of exact forces belongs to the central point for 1e-6 (float32: 1e-4) of the margin's natural scale. With
+        smoothing all are those of the answer. Exactly zero for grasps without a finite margin.
     """
     pyramid_facets(cone_edges)
     return over_grasps(
@@ -132,6 +139,11 @@ def least_effort(
     Status:
         As in `largest_disturbance`; INFEASIBLE where the margin is above what (21) allows; INVALID_INPUT where it is
         negative or NaN.
+
+    Derivatives:
+        As in `largest_disturbance`, the margin asked for included; of exact forces those of the central point for 1e-8
+        (float32: 1e-5) of the effort's scale. `margin` varies like the one asked for, `upper_bound` counts as constant.
+        Zero for grasps without an answer.
     """
     pyramid_facets(cone_edges)
     return over_grasps(
@@ -190,7 +202,7 @@ class _LargestDisturbance(_Tightening):
         if not self.smooth:
             adjoint = partial(envelope_adjoint, self.cone_edges)
             change = change._replace(margin=along.adjoint(adjoint, point, (out.margin,))[0])
-        return _changed(out, change)
+        return _changed(out, change, change.margin)
 
 
 class _LeastEffort(_Tightening):
@@ -198,12 +210,12 @@ class _LeastEffort(_Tightening):
         return _solve_effort(grasps, program, *_solve_margin(replace(grasps, smoothing=None), program))
 
     def tangents(self, along: Along, out: Solution) -> Solution:
-        return _changed(out, self._central(along, self._point(out, jnp.isfinite(out.effort))))
+        return _changed(out, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)
 
 
-def _changed(out: Solution, change: Point) -> Solution:
+def _changed(out: Solution, change: Point, upper_bound: jax.Array | None) -> Solution:
     """A change of a solution; None for what does not vary, or counts as if it did not."""
-    varying = change._asdict() | {"upper_bound": change.margin}
+    varying = change._asdict() | {"upper_bound": upper_bound}
     return Solution(**{f.name: varying.get(f.name) for f in fields(out)})
 
 
@@ -248,7 +260,9 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     answered = ~jnp.isnan(margin)
     forces = program.forces(record.x[0]) * program.blocks.present[:, None]
     scale = program.scale
-    multipliers = record.z[0] * scale / program.row_units()
+    # Where the program's optimum is not the margin, its multipliers say nothing.
+    told = ~(program.disturbance_outside | program.undisturbed | program.slippery & (low > 0))
+    multipliers = jnp.where(told, record.z[0] * scale / program.row_units(), 0)
     solution = Solution(
         margin=margin,
         upper_bound=upper,
@@ -262,7 +276,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
         rank=program.rank,
         cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
         bound_multipliers=multipliers[-1],
-        wrench_multipliers=program.wrench_multipliers(record.y, grasps.units) * scale,
+        wrench_multipliers=jnp.where(told, program.wrench_multipliers(record.y, grasps.units) * scale, 0),
     )
     if grasps.smoothing is None:
         return solution, record

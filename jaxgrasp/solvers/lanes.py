@@ -5,7 +5,7 @@ CPUs the lanes are cut into tiles that stay in the cache; elsewhere they go at o
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -61,24 +61,37 @@ def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...],
 
     @run.def_vmap
     def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
-        (batched,) = batched
-        lanes = next(x.shape[1 if b else 0] for x, b, s in zip(leaves, batched, shared, strict=True) if not s)
-        merged, still_shared = [], []
-        for leaf, is_batched, is_shared in zip(leaves, batched, shared, strict=True):
-            still_shared.append(is_shared and not is_batched)
-            if is_shared and not is_batched:
-                merged.append(leaf)
-                continue
-            if is_shared:
-                leaf = jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
-            elif not is_batched:
-                leaf = jnp.broadcast_to(leaf[None], (size, *leaf.shape))
-            merged.append(leaf.reshape(size * lanes, *leaf.shape[2:]))
-        out = _run(stages, structure, tuple(still_shared), rows)(merged)
+        merged, still_shared, lanes = merged_axes(leaves, batched[0], shared, size)
+        out = _run(stages, structure, still_shared, rows)(merged)
         out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     return run
+
+
+def merged_axes(
+    leaves: list[jax.Array], mapped: Sequence[bool], shared: Sequence[bool], size: int
+) -> tuple[list[jax.Array], tuple[bool, ...], int]:
+    """Leaves with a leading mapped axis made part of the lanes, what is then still shared, and the lanes before.
+
+    Args:
+        leaves: with a leading axis of the given size where mapped, then the lanes where not shared.
+        mapped: for every leaf.
+        shared: for every leaf.
+        size: of the mapped axis.
+    """
+    lanes = next(x.shape[1 if m else 0] for x, m, s in zip(leaves, mapped, shared, strict=True) if not s)
+    merged = []
+    for leaf, is_mapped, is_shared in zip(leaves, mapped, shared, strict=True):
+        if is_shared and not is_mapped:
+            merged.append(leaf)
+            continue
+        if is_shared:
+            leaf = jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
+        elif not is_mapped:
+            leaf = jnp.broadcast_to(leaf, (size, *leaf.shape))
+        merged.append(leaf.reshape(size * lanes, *leaf.shape[2:]))
+    return merged, tuple(s and not m for s, m in zip(shared, mapped, strict=True)), lanes
 
 
 def tiled(

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jaxgrasp.solvers.lanes import tiled
+from jaxgrasp.solvers.lanes import merged_axes, tiled
 
 Tree = Any
 Kernel = Callable[[list[jax.Array], list[jax.Array]], list[jax.Array]]
@@ -202,22 +202,11 @@ def _transpose(cotangents: Any, *args: Any, spec: _Map) -> list:
 
 def _batch(args: Any, dims: Any, *, spec: _Map) -> tuple[list, list]:
     size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
-    shared_args = spec.shared + (False,) * (len(args) - len(spec.shared))
     mapped = [d is not None for d in dims]
     front = [jnp.moveaxis(x, d, 0) if m else x for x, d, m in zip(args, dims, mapped, strict=True)]
-    lanes = next(x.shape[1 if m else 0] for x, m, s in zip(front, mapped, shared_args, strict=True) if not s)
-    merged, still = [], []
-    for x, m, s in zip(front, mapped, shared_args, strict=True):
-        still.append(s and not m)
-        if s and not m:
-            merged.append(x)
-            continue
-        if s:
-            x = jnp.broadcast_to(x[:, None], (size, lanes, *x.shape[1:]))
-        elif not m:
-            x = _spread(x, size)
-        merged.append(x.reshape(size * lanes, *x.shape[2:]))
-    out = _linear_lanes_p.bind(*merged, spec=spec._replace(shared=tuple(still[: len(spec.shared)])))
+    shared = spec.shared + (False,) * (len(args) - len(spec.shared))
+    merged, still, lanes = merged_axes(front, mapped, shared, size)
+    out = _linear_lanes_p.bind(*merged, spec=spec._replace(shared=still[: len(spec.shared)]))
     return [x.reshape(size, lanes, *x.shape[1:]) for x in out], [0] * len(out)
 
 
