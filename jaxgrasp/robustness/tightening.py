@@ -183,7 +183,8 @@ class _Tightening:
 
     def _point(self, out: Solution, usable: jax.Array) -> Point:
         if self.smooth:
-            usable &= out.status != Status.MAX_ITERATIONS
+            # At a central point all multipliers are positive; where there is none they are zero, or it was not found.
+            usable &= (out.status != Status.MAX_ITERATIONS) & jnp.any(out.bound_multipliers > 0, -1)
         return Point(usable=usable, **{name: getattr(out, name) for name in Point._fields if name != "usable"})
 
     def _central(self, along: Along, point: Point) -> Point:
