@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -56,6 +57,10 @@ def programs(weights: jax.Array) -> dict:
     }
 
 
+def wait_for(program, x: tuple) -> None:
+    jax.block_until_ready(program(*x))
+
+
 def measure(dtype) -> list[str]:
     grasps = problems.sample(BATCH, CONTACTS)
     x = jnp.asarray(grasps.positions, dtype), jnp.asarray(grasps.frames, dtype)
@@ -65,7 +70,7 @@ def measure(dtype) -> list[str]:
         start = time.perf_counter()
         ready = jax.jit(program, compiler_options=options()).lower(*x).compile()
         compiled[name] = time.perf_counter() - start
-        jobs[name] = lambda ready=ready: jax.block_until_ready(ready(*x)) and None
+        jobs[name] = partial(wait_for, ready, x)
     timings = by_turns(jobs, ROUNDS)
     base = timings["margin"].seconds
     precision = jnp.dtype(dtype).name
