@@ -170,17 +170,15 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
         pull = pull + ct.effort * weighed
         effort_weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
     right_x = jnp.moveaxis(pull, 1, 0) * scales * grasps.present
-    right_z = jnp.zeros_like(z)
-    if ct.cone_multipliers is not None:
-        right_z = right_z.at[:-1].add(jnp.moveaxis(ct.cone_multipliers, 1, 0))
-    if ct.bound_multipliers is not None:
-        right_z = right_z.at[-1].add(ct.bound_multipliers)
+    cone = jnp.zeros_like(z[:-1]) if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)
+    bound = jnp.zeros_like(z[-1]) if ct.bound_multipliers is None else ct.bound_multipliers
+    right_z = jnp.concatenate([cone, bound[None]]) * unit / row_units * grasps.present
     right_y, right_lambda = jnp.zeros_like(problem.rhs), None
     if ct.wrench_multipliers is not None:
         right_y = program.wrench_multipliers_adjoint(ct.wrench_multipliers, grasps.units) * unit
     if problem.bordered:
         right_lambda = jnp.zeros_like(unit) if ct.margin is None else ct.margin * program.scale
-    right = ((right_x,), right_lambda, right_y, (right_z * unit / row_units * grasps.present,))
+    right = ((right_x,), right_lambda, right_y, (right_z,))
     (move_x,), move_lambda, move_y, (values,) = solve_symmetric(problem, (s,), (z,), right)
 
     # Back in newtons: forces, margin, and multipliers for an objective in the solver's unit.
@@ -269,7 +267,6 @@ def _iterate(
         s = group.h - apply_rows(group, x) - (group.sigma * lam if problem.bordered else 0)
         s = jnp.where(program.present > 0, clean(s, 1), 1)
     else:
-        z = jnp.maximum(z, jnp.finfo(z.dtype).tiny * 1e8) * program.present
         s = jnp.where(program.present > 0, clean(kappa / jnp.where(program.present > 0, z, 1), 1), 1)
     pull = adjoint_rows(group, z)
     if group.hessian is not None:
