@@ -117,6 +117,7 @@ class TestLargestDisturbance:
         assert np.median(iterations) <= MEDIAN_ITERATIONS
         assert np.percentile(iterations, 99) <= TAIL_ITERATIONS
 
+    @pytest.mark.thorough
     def test_single_precision(self):
         inside, lies = [], []
         for name in problems.GROUPS:

@@ -72,6 +72,7 @@ def test_kinks_have_valid_subgradients(gradient):
     assert kinks > 20
 
 
+@pytest.mark.thorough
 def test_hessians_are_symmetric_and_right():
     positions = jnp.asarray(ball_grasps(1, 3, seed=5)[0])
 

@@ -13,8 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
+import pytest
 
 import jaxgrasp as jg
+
+pytestmark = pytest.mark.thorough
 
 LANES, CONTACTS, EDGES = 1000, 4, 8
 KAPPA = {"bounds": 1e-9, "margin": 1e-6, "effort": 1e-8}
