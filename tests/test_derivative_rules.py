@@ -139,6 +139,12 @@ def test_smoothed_sets_bound_the_sets():
     assert np.all(softer <= ours + 1e-9)
 
 
+def test_one_compliance_a_direction_needs_a_sharp_set():
+    every = jg.Compliance.per_direction(np.broadcast_to(np.eye(3), (6, 4, 3, 3)))
+    with pytest.raises(ValueError, match="compliance: .*smoothed"):
+        jg.largest_disturbance(contacts_on_ball(ball_grasps(2)), FORCES.smoothed(0.1), compliance=every)
+
+
 def test_single_precision_gradients_are_finite():
     rng = np.random.default_rng(6)
     directions, axes = problems.unit_vectors(rng, 100_000, 4), rng.uniform(0.02, 0.06, (100_000, 1, 3))

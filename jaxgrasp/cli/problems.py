@@ -1,7 +1,8 @@
-"""What can be found wrong with a command line before any long work."""
+"""What can be found wrong with a command line before any long work, and with its files in the end."""
 
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 
@@ -36,3 +37,25 @@ def check_output(path: Path, option: str, endings: Sequence[str], inputs: Sequen
             os.unlink(path)
     except OSError as error:
         raise CommandError(f"{option} {path}: cannot be written ({(error.strerror or str(error)).lower()})") from error
+
+
+def write_files(*jobs: tuple[Path | None, Callable[[Path], None]]) -> tuple[list[Path], bool]:
+    """Writes one file after the other; what cannot be written is told on standard error and keeps no other back.
+
+    Args:
+        jobs: File, None where it is not wanted, and what writes it.
+
+    Returns:
+        The files that were written, and whether any could not be.
+    """
+    written, failed = [], False
+    for path, write in jobs:
+        if path is None:
+            continue
+        try:
+            write(path)
+            written.append(path)
+        except OSError as error:
+            print(f"jaxgrasp: {path}: cannot be written ({error.strerror or error})", file=sys.stderr)
+            failed = True
+    return written, failed

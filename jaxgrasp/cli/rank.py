@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from jaxgrasp.cli.problems import CommandError, check_output
+from jaxgrasp.cli.problems import CommandError, check_output, write_files
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
 if TYPE_CHECKING:
@@ -148,20 +148,7 @@ class Rank:
         from jaxgrasp.ranking import write_table
         from jaxgrasp.viewer import figure_of_ranking, write_figure
 
-        written, failed = [], False
-        for path, write in (
-            (self.output, lambda path: write_table(ranking, path)),
-            (
-                self.figure,
-                lambda path: write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity)), path),
-            ),
-        ):
-            if path is None:
-                continue
-            try:
-                write(path)
-                written.append(path)
-            except OSError as error:
-                print(f"jaxgrasp: {path}: cannot be written ({error.strerror or error})", file=sys.stderr)
-                failed = True
-        return written, failed
+        def write_picture(path: Path) -> None:
+            write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity)), path)
+
+        return write_files((self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture))

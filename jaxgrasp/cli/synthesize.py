@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxgrasp.cli.problems import CommandError, check_output
+from jaxgrasp.cli.problems import CommandError, check_output, write_files
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
 if TYPE_CHECKING:
@@ -94,9 +94,9 @@ class Synthesize:
         found = self._synthesize(shape, centre, disturbances)
         from jaxgrasp.cli.report import print_synthesis
 
-        written = self._write(found, shape, name, unit)
+        written, failed = self._write(found, shape, name, unit)
         print_synthesis(found, name, note, unit, written)
-        return 0 if len(written) == 1 + (self.figure is not None) else 2
+        return 2 if failed else 0
 
     def _check(self) -> None:
         span = math.inf if self.span is None else self.span
@@ -177,9 +177,7 @@ class Synthesize:
                 progress=progress,
             )
 
-    def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> list[Path]:
-        import sys
-
+    def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], bool]:
         import jax
         import numpy as np
 
@@ -204,13 +202,4 @@ class Synthesize:
         def write_picture(path: Path) -> None:
             write_figure(figure_of_synthesis(found, surface, friction=self.friction, name=name, unit=unit), path)
 
-        written = []
-        for path, write in ((self.output, write_candidates), (self.figure, write_picture)):
-            if path is None:
-                continue
-            try:
-                write(path)
-                written.append(path)
-            except OSError as error:
-                print(f"jaxgrasp: {path}: cannot be written ({error.strerror or error})", file=sys.stderr)
-        return written
+        return write_files((self.output, write_candidates), (self.figure, write_picture))

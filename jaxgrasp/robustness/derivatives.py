@@ -9,7 +9,7 @@ and the margin itself where smoothing is asked for, by the implicit function the
 `sensitivity`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -20,11 +20,11 @@ import numpy as np
 from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.kernels import Along
-from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem
-from jaxgrasp.robustness.program import Program, scaled_program
+from jaxgrasp.robustness.kernels import Along, OfPyramids
+from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem, weighed
+from jaxgrasp.robustness.program import Program, prepared, scaled_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
-from jaxgrasp.solvers.block_kkt import BlockProblem, adjoint_rows, apply_rows, total
+from jaxgrasp.solvers.block_kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows, total
 from jaxgrasp.solvers.interior_point import Iterate
 from jaxgrasp.solvers.sensitivity import central_point, solve_symmetric
 
@@ -121,25 +121,13 @@ def _nothing(x: jax.Array) -> jax.Array | np.ndarray:
     return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
 
 
-@dataclass(frozen=True)
-class CentralPoint:
+class CentralPoint(OfPyramids):
     """The kernel that finds the central point next to a point of (21) or, where a margin is asked for, of (22)."""
-
-    cone_edges: int
-
-    @property
-    def rows(self) -> int:
-        """See `Kernel`."""
-        return max(8, self.cone_edges)
 
     @property
     def stages(self) -> tuple:
         """See `Kernel`; the point is held."""
-        return (self._prepare, lambda prepared: self._find(*prepared))
-
-    def _prepare(self, grasps: Grasps, point: Point) -> tuple[Grasps, Program, Point]:
-        program = scaled_program(grasps, self.cone_edges)
-        return replace(grasps, terms=(), extents=()), program, point
+        return (lambda grasps, point: (*prepared(grasps, self.cone_edges), point), lambda given: self._find(*given))
 
     def _find(self, grasps: Grasps, program: Program, point: Point) -> Point:
         problem, unit = _problem(grasps, program)
@@ -166,8 +154,7 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
     effort_weights = None
     if ct.effort is not None:
-        weighed = forces if grasps.weights is None else jnp.einsum("nab...,nb...->na...", grasps.weights, forces)
-        pull = pull + ct.effort * weighed
+        pull = pull + ct.effort * weighed(forces, grasps.weights)
         effort_weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
     right_x = jnp.moveaxis(pull, 1, 0) * scales * grasps.present
     cone = jnp.zeros_like(z[:-1]) if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)
@@ -270,6 +257,5 @@ def _iterate(
         s = jnp.where(program.present > 0, clean(kappa / jnp.where(program.present > 0, z, 1), 1), 1)
     pull = adjoint_rows(group, z)
     if group.hessian is not None:
-        half = fold(jnp.add, jnp.moveaxis(group.hessian * x, 1, 0))
-        pull = pull + fold(jnp.add, group.hessian * half[:, None])
+        pull = pull + apply_hessian(group, x)
     return Iterate(((x,), lam) if problem.bordered else (x,), -problem.equality((pull,)), (s,), (z,))

@@ -181,6 +181,8 @@ def _per_vertex(compliance: Compliance, disturbances: DisturbanceSet, n: int) ->
             "compliance: got one Q for each direction, wanted a single Q, "
             "since the disturbance set is not given by vertices; use DisturbanceSet.vertices"
         )
+    if disturbances.terms[0].width is not None:
+        raise ValueError("compliance: got one Q for each direction, wanted a single Q, since the set is smoothed")
     array, count = compliance.per_vertex, disturbances.terms[0].wrenches.shape[-2]
     for event in ((count, n, 3, 3), (count, 3 * n, 3 * n)):
         if array.shape[-len(event) :] == event:

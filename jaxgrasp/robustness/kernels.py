@@ -4,6 +4,7 @@ The values come from stages that JAX does not look into (the solver's loop runs 
 functions of the same data that are as cheap as they can be, see `derivatives`; here they are applied to lanes.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -54,7 +55,19 @@ class Kernel(Protocol):
         ...
 
 
-class Plain:
+@dataclass(frozen=True)
+class OfPyramids:
+    """A kernel with the rows of friction pyramids."""
+
+    cone_edges: int
+
+    @property
+    def rows(self) -> int:
+        """See `Kernel`; for fewer than eight edges, tiles are large enough."""
+        return max(8, self.cone_edges)
+
+
+class Plain(ABC):
     """A kernel of one stage that is its own derivative's function."""
 
     @property
@@ -62,9 +75,9 @@ class Plain:
         """See `Kernel`."""
         return (lambda admitted, _: self.evaluate(admitted),)
 
+    @abstractmethod
     def evaluate(self, admitted: Any) -> Tree:
         """The results, lanes last."""
-        raise NotImplementedError
 
     def tangents(self, along: "Along", out: Tree) -> Tree:
         """See `Kernel`."""

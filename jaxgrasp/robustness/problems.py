@@ -52,7 +52,11 @@ def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort
     return Effort(problem, wanted, largest)
 
 
+def weighed(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
+    """Q_0 f of forces (n, 3, *lanes); weights None for Q_0 = I."""
+    return forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
+
+
 def effort_of(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
     """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
-    weighed = forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
-    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed))
+    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed(forces, weights)))

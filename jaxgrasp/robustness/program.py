@@ -7,7 +7,7 @@ are dropped.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -160,6 +160,11 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         wrench_outside=outside,
         slippery=((grasps.friction <= 0) & (fold(jnp.maximum, cone) > 0)).any(0),
     )
+
+
+def prepared(grasps: Grasps, cone_edges: int) -> tuple[Grasps, Program]:
+    """The programs, and what else of the grasps is needed to solve them: not the disturbance set."""
+    return replace(grasps, terms=(), extents=()), scaled_program(grasps, cone_edges)
 
 
 def _doubtful(basis: Basis) -> jax.Array:

@@ -1,5 +1,6 @@
 """Tightening forces: the largest-minimum resisted disturbance (21) and the least effort (22)."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -14,9 +15,9 @@ from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.derivatives import CentralPoint, Point, central_kappa, centred, envelope_adjoint
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
-from jaxgrasp.robustness.kernels import Along
+from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem
-from jaxgrasp.robustness.program import Program, scaled_program
+from jaxgrasp.robustness.program import Program, prepared
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block_kkt import Record
@@ -160,26 +161,17 @@ def least_effort(
 
 
 @dataclass(frozen=True)
-class _Tightening:
+class _Tightening(OfPyramids, ABC):
     """What the kernels of (21) and (22) share."""
 
-    cone_edges: int
     smooth: bool
 
     @property
-    def rows(self) -> int:
-        return max(8, self.cone_edges)
-
-    @property
     def stages(self) -> tuple:
-        return (lambda grasps, _: self._prepare(grasps), lambda prepared: self._solve(*prepared))
+        return (lambda grasps, _: prepared(grasps, self.cone_edges), lambda given: self._solve(*given))
 
-    def _prepare(self, grasps: Grasps) -> tuple[Grasps, Program]:
-        program = scaled_program(grasps, self.cone_edges)
-        return replace(grasps, terms=(), extents=()), program
-
-    def _solve(self, grasps: Grasps, program: Program) -> Solution:
-        raise NotImplementedError
+    @abstractmethod
+    def _solve(self, grasps: Grasps, program: Program) -> Solution: ...
 
     def _point(self, out: Solution, usable: jax.Array) -> Point:
         if self.smooth:

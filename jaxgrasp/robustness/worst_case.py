@@ -5,7 +5,7 @@ most h_D(-(C G*)_ik) and the bound on its normal force at most h_D((E G*)_i): S_
 whatever kind of set D is.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -22,7 +22,7 @@ from jaxgrasp.disturbance.sets import furthest, support
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.fence import each, fenced
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
-from jaxgrasp.robustness.kernels import Plain
+from jaxgrasp.robustness.kernels import OfPyramids, Plain
 
 
 def worst_case(
@@ -50,14 +50,7 @@ def worst_case(
     return over_grasps(_WorstCase(cone_edges), contacts, disturbances, compliance=compliance)
 
 
-@dataclass(frozen=True)
-class _WorstCase(Plain):
-    cone_edges: int
-
-    @property
-    def rows(self) -> int:
-        return max(8, self.cone_edges)
-
+class _WorstCase(OfPyramids, Plain):
     def evaluate(self, grasps: Grasps) -> tuple[jax.Array, jax.Array]:
         cone, bound, _ = worst_rows(grasps, self.cone_edges)
         hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)  # noqa: E731

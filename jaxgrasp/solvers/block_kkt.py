@@ -88,6 +88,12 @@ def adjoint_rows(group: Blocks, z: jax.Array) -> jax.Array:
     return fold(jnp.add, spread_over(group.patterns, z) * z[:, None])
 
 
+def apply_hessian(group: Blocks, x: jax.Array) -> jax.Array:
+    """H x = root' root x, (k, n, *lanes)."""
+    half = fold(jnp.add, jnp.moveaxis(group.hessian * x, 1, 0))
+    return fold(jnp.add, group.hessian * half[:, None])
+
+
 def spread_over(values: jax.Array, like: jax.Array) -> jax.Array:
     """Append axes, to weigh arrays of which `like` is one along its leading axis."""
     return values.reshape(values.shape + (1,) * (like.ndim - 1))

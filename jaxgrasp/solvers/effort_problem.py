@@ -9,11 +9,11 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.fence import fenced, repeat
 from jaxgrasp.solvers.block_kkt import (
     BlockProblem,
-    Blocks,
     Factors,
     Record,
     Rows,
     adjoint_rows,
+    apply_hessian,
     apply_rows,
     least,
     total,
@@ -45,19 +45,15 @@ class EffortProblem(BlockProblem):
         )
         z = tuple(0.02 * g.present / s_g for g, s_g in zip(self.groups, s, strict=True))
         pull = tuple(
-            self._gradient(g, x) + adjoint_rows(g, z_g) for g, x, z_g in zip(self.groups, blocks, z, strict=True)
+            apply_hessian(g, x) + adjoint_rows(g, z_g) for g, x, z_g in zip(self.groups, blocks, z, strict=True)
         )
         return Iterate(blocks, -self.equality(pull), s, z)
-
-    def _gradient(self, g: Blocks, x: jax.Array) -> jax.Array:
-        half = fold(jnp.add, jnp.moveaxis(g.hessian * x, 1, 0))
-        return fold(jnp.add, g.hessian * half[:, None])
 
     def residuals(self, iterate: Iterate) -> Residuals:
         """Of stationarity, of E x = b and of the rows."""
         blocks = iterate.x
         dual = tuple(
-            self._gradient(g, x) + adjoint_rows(g, z) + e
+            apply_hessian(g, x) + adjoint_rows(g, z) + e
             for g, x, z, e in zip(self.groups, blocks, iterate.z, self.pull_back(iterate.y), strict=True)
         )
         rows = tuple(apply_rows(g, x) + s - g.h for g, x, s in zip(self.groups, blocks, iterate.s, strict=True))
@@ -69,7 +65,7 @@ class EffortProblem(BlockProblem):
         def improve(_: jax.Array, state: tuple) -> tuple:
             dx, dy, rows = state
             rhs = tuple(
-                -d - adjoint_rows(g, e + w * r) - self._gradient(g, x) - t
+                -d - adjoint_rows(g, e + w * r) - apply_hessian(g, x) - t
                 for g, d, e, w, r, x, t in zip(
                     self.groups, residuals.dual, shift, factors.weights, rows, dx, self.pull_back(dy), strict=True
                 )
@@ -98,7 +94,7 @@ class EffortProblem(BlockProblem):
         x = fenced(self.project)(iterate.x)
 
         def value(x: Rows) -> jax.Array:
-            terms = [total(x_g * self._gradient(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
+            terms = [total(x_g * apply_hessian(g, x_g)) for g, x_g in zip(self.groups, x, strict=True)]
             return 0.5 * fold(jnp.add, terms)
 
         over = [jnp.maximum(apply_rows(g, x_g) - g.h, 0) for g, x_g in zip(self.groups, x, strict=True)]

@@ -36,7 +36,7 @@ class Settings(NamedTuple):
     gap_floor: gaps up to this one count as closed, whatever their scale; the loop then ends near a central point.
     """
 
-    tolerance: float | jax.Array
+    tolerance: float
     max_iterations: int
     step_cap: float
     mu_floor: float | jax.Array
@@ -141,7 +141,7 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
     lanes = len(problem.lanes)
     present = problem.present
     iterate = fenced(problem.start)()
-    count = _reduce(jnp.add, jax.tree.map(lambda p, s: jnp.broadcast_to(p, s.shape), present, iterate.s), lanes)
+    count = reduce_rows(jnp.add, jax.tree.map(lambda p, s: jnp.broadcast_to(p, s.shape), present, iterate.s), lanes)
     inverse_count = 1 / jnp.maximum(count, 1)
     mu = _product(iterate.s, iterate.z, lanes) * inverse_count
 
@@ -216,8 +216,8 @@ def _predict_correct(
         """ds, dz and the reciprocals of the steps that reach the boundary."""
         ds = jax.tree.map(lambda r, a: -r - a, lacking, rows)
         dz = jax.tree.map(lambda e, w, a: e + w * a, shift, weights, rows)
-        primal = _reduce(jnp.maximum, jax.tree.map(lambda d, i: -d * i, ds, inverse_s), lanes)
-        dual = _reduce(jnp.maximum, jax.tree.map(lambda d, i: -d * i, dz, inverse_z), lanes)
+        primal = reduce_rows(jnp.maximum, jax.tree.map(lambda d, i: -d * i, ds, inverse_s), lanes)
+        dual = reduce_rows(jnp.maximum, jax.tree.map(lambda d, i: -d * i, dz, inverse_z), lanes)
         if settings.equal_steps:
             primal = dual = jnp.maximum(primal, dual)
         return ds, dz, primal, dual
@@ -231,7 +231,7 @@ def _predict_correct(
         reached = jax.tree.map(
             lambda s, z, ds, dz: (s + primal * ds) * (z + dual * dz), iterate.s, iterate.z, affine.s, affine.z
         )
-        ratio = inverse_count * _reduce(jnp.add, reached, lanes) / mu
+        ratio = inverse_count * reduce_rows(jnp.add, reached, lanes) / mu
         aim = jnp.maximum(ratio * ratio * ratio * mu, settings.mu_floor)
         return jax.tree.map(
             lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, affine.s, affine.z, inverse_s, present
@@ -272,10 +272,10 @@ def _axpy(step: jax.Array, direction: Tree, point: Tree) -> Tree:
 
 
 def _product(a: Tree, b: Tree, lanes: int) -> jax.Array:
-    return _reduce(jnp.add, jax.tree.map(jnp.multiply, a, b), lanes)
+    return reduce_rows(jnp.add, jax.tree.map(jnp.multiply, a, b), lanes)
 
 
-def _reduce(op: Any, tree: Tree, lanes: int) -> jax.Array:
+def reduce_rows(op: Any, tree: Tree, lanes: int) -> jax.Array:
     """Reduce all leaves over everything but the trailing lane axes, unrolled: XLA's CPU code vectorises over lanes."""
     if not lanes:
         # Nothing to vectorise over, and a hundred rows would be a hundred operations.

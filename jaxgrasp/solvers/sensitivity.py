@@ -27,8 +27,8 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.fence import fenced, repeat
-from jaxgrasp.solvers.block_kkt import BlockProblem, Rows, adjoint_rows, apply_rows, total
-from jaxgrasp.solvers.interior_point import Iterate, Residuals
+from jaxgrasp.solvers.block_kkt import BlockProblem, Rows, adjoint_rows, apply_hessian, apply_rows, total
+from jaxgrasp.solvers.interior_point import Iterate, Residuals, reduce_rows
 
 _STEPS = 30
 # Newton's step, a quarter of it, a sixteenth ...: the best of so many is taken.
@@ -72,7 +72,7 @@ def central_point(problem: BlockProblem, start: Iterate, kappa: jax.Array, activ
     def at(x: Any, y: jax.Array, v: Rows) -> tuple[Iterate, Residuals, jax.Array]:
         iterate = Iterate(x, y, *on_path(v))
         residuals = fenced(problem.residuals)(iterate)
-        return iterate, residuals, _largest(residuals, len(problem.lanes))
+        return iterate, residuals, reduce_rows(jnp.maximum, jax.tree.map(jnp.abs, residuals), len(problem.lanes))
 
     def unfinished(state: tuple) -> jax.Array:
         *_, step, going = state
@@ -80,7 +80,7 @@ def central_point(problem: BlockProblem, start: Iterate, kappa: jax.Array, activ
 
     def body(state: tuple) -> tuple:
         point, (iterate, residuals, error), step, going = state
-        weights = _weights(problem, iterate)
+        weights = _weights(problem, iterate.s, iterate.z)
         shift = jax.tree.map(jnp.multiply, weights, residuals.rows)
         dx, dy, rows = problem.solve(problem.factor(weights), residuals, shift)
         dz = jax.tree.map(lambda w, r, c: w * (r + c), weights, residuals.rows, rows)
@@ -108,8 +108,7 @@ def solve_symmetric(problem: BlockProblem, s: Rows, z: Rows, right: tuple) -> tu
 
     Linear in these, and differentiable through its matrix alone: not through the factorisation.
     """
-    present = problem.present
-    weights = tuple(z_g * p / s_g for z_g, s_g, p in zip(z, s, present, strict=True))
+    present, weights = problem.present, _weights(problem, s, z)
     stiff = tuple(
         jnp.where(p > 0, s_g / jnp.where(p > 0, z_g, 1), 1) for z_g, s_g, p in zip(z, s, present, strict=True)
     )
@@ -120,8 +119,7 @@ def solve_symmetric(problem: BlockProblem, s: Rows, z: Rows, right: tuple) -> tu
         for g, x, row, e in zip(problem.groups, dx, dz, problem.pull_back(dy), strict=True):
             left = adjoint_rows(g, row * g.present) + e + (1 - g.present) * x
             if g.hessian is not None:
-                half = fold(jnp.add, jnp.moveaxis(g.hessian * x, 1, 0))
-                left = left + fold(jnp.add, g.hessian * half[:, None])
+                left = left + apply_hessian(g, x)
             out.append(left)
         rows = tuple(apply_rows(g, x) * g.present for g, x in zip(problem.groups, dx, strict=True))
         pull = None
@@ -158,15 +156,5 @@ def solve_symmetric(problem: BlockProblem, s: Rows, z: Rows, right: tuple) -> tu
     return lax.custom_linear_solve(matrix, right, solve, symmetric=True)
 
 
-def _weights(problem: BlockProblem, iterate: Iterate) -> Rows:
-    return tuple(z * p / s for z, s, p in zip(iterate.z, iterate.s, problem.present, strict=True))
-
-
-def _largest(residuals: Residuals, lanes: int) -> jax.Array:
-    parts = []
-    for leaf in jax.tree.leaves(residuals):
-        part = jnp.abs(leaf)
-        while part.ndim > lanes:
-            part = fold(jnp.maximum, part)
-        parts.append(part)
-    return fold(jnp.maximum, parts)
+def _weights(problem: BlockProblem, s: Rows, z: Rows) -> Rows:
+    return tuple(z_g * p / s_g for z_g, s_g, p in zip(z, s, problem.present, strict=True))

@@ -6,7 +6,7 @@ margin: what is found with one is a lower bound of what holds without.
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -154,13 +154,10 @@ def _step(state: State, task: Task, number: Array, key: PRNGKeyArray, cone_edges
     slope, (margin, outward) = jax.grad(total, has_aux=True)(state.points)
     kept = task.placing.shortfall(state.points, outward) <= TOLERANCE * task.size
     better = kept & (margin > state.best_margin)
-    state = State(
-        starts=state.starts,
-        points=state.points,
-        momentum=state.momentum,
+    state = replace(
+        state,
         best_points=jnp.where(better[:, None, None], state.points, state.best_points),
         best_margin=jnp.where(better, margin, state.best_margin),
-        restarts=state.restarts,
     )
     # Optax raises floats to integer powers, which users of strict promotion have forbidden.
     with jax.numpy_dtype_promotion("standard"):
@@ -177,12 +174,10 @@ def _step(state: State, task: Task, number: Array, key: PRNGKeyArray, cone_edges
     def renewed(fresh: Array, old: Array) -> Array:
         return jnp.where(again.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
 
-    return State(
-        starts=state.starts,
+    return replace(
+        state,
         points=renewed(pool, points),
         momentum=jax.tree.map(lambda old: renewed(jnp.zeros_like(old), old), momentum),
-        best_points=state.best_points,
-        best_margin=state.best_margin,
         restarts=state.restarts + again.astype(jnp.int32),
     )
 
