@@ -10,12 +10,14 @@ import numpy as np
 
 from jaxgrasp.arrays import as_float, broadcast_batch, fold
 from jaxgrasp.compiling import compiled
+from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import Vertices
+from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
 
 
@@ -61,6 +63,13 @@ class Grasps:
     """(*lanes), the margin that is asked for."""
     smoothing: jax.Array | None
     """(*lanes), kappa of the central point that is asked for."""
+    actuated: Actuated | None
+    """What the hand's actuators can do; None where the fingers can push at will."""
+
+    @property
+    def rows(self) -> jax.Array:
+        """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
+        return stacked_rows(self.columns, self.actuated)
 
 
 def over_grasps(
@@ -73,6 +82,7 @@ def over_grasps(
     effort_weights: Any = None,
     margin: Any = None,
     smoothing: Any = None,
+    actuation: Any = None,
 ) -> Any:
     """Check shapes, run a kernel over all grasps of a batch and give its results the batch's shape.
 
@@ -97,6 +107,9 @@ def over_grasps(
     for name, value in given.items():
         if value is not None and not isinstance(value, Compliance):
             given[name] = as_float(name, value, ())
+    if actuation is not None and not isinstance(actuation, Actuation):
+        raise ValueError(f"actuation: got {type(actuation).__name__}, wanted jaxgrasp.Actuation")
+    given["actuation"] = actuation
     return _run(kernel, contacts, disturbances, given)
 
 
@@ -120,6 +133,8 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
     for name in ("margin", "smoothing"):
         if given[name] is not None:
             other[name] = _argument(name, given[name], ())
+    if given["actuation"] is not None:
+        other |= _actuation(given["actuation"], n)
     batch = broadcast_batch(
         contacts=contacts.batch_shape,
         disturbances=disturbances.batch_shape,
@@ -147,7 +162,7 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
         return _admit(raw, terms.terms, extents)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
+    compact = not {"compliance", "per_vertex", "weights", "jacobian"} & set(arguments)
     lanes = Lanes(admit, shared, n * (kernel.rows + 1), compact)
     out = differentiable(kernel, lanes, arguments)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
@@ -160,6 +175,9 @@ _PUBLIC = {
     "per_vertex": "compliance",
     "weights": "effort_weights",
 }
+
+
+_TRANSMISSION = {"transmission", "inverse", "unreached"}
 
 
 def _argument(name: str, value: Any, event: tuple[int, ...]) -> tuple[jax.Array, tuple[int, ...]]:
@@ -193,6 +211,17 @@ def _per_vertex(compliance: Compliance, disturbances: DisturbanceSet, n: int) ->
     )
 
 
+def _actuation(actuation: Actuation, n: int) -> dict[str, tuple[jax.Array, tuple[int, ...]]]:
+    if actuation.jacobian.shape[-3] != n:
+        raise ValueError(
+            f"actuation: got a jacobian of shape {actuation.jacobian.shape}, wanted (*batch, {n}, 3, n_v), "
+            f"one for each of the {n} contacts"
+        )
+    trailing = {"jacobian": 3, "transmission": 2, "inverse": 2, "unreached": 2, "lower": 1, "upper": 1}
+    leaves = {name: getattr(actuation, name) for name in trailing}
+    return {name: (x, x.shape[: x.ndim - trailing[name]]) for name, x in leaves.items() if x is not None}
+
+
 def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[jax.Array, ...]) -> Grasps:
     """Check the data of every lane and replace what cannot be used."""
     positions, frames, active = raw["positions"], raw["frames"], raw["active"]
@@ -216,6 +245,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
     valid &= jnp.isfinite(raw["wrench"]).all(0) & (raw["reserve"] >= 0) & jnp.isfinite(raw["reserve"])
     for extent in extents:
         valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)
+    valid &= _sound_actuation(raw, active)
     margin = raw.get("margin")
     if margin is not None:
         valid &= (margin >= 0) & jnp.isfinite(margin)
@@ -233,11 +263,12 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
     length = jax.lax.stop_gradient(jnp.sqrt(jnp.where(mean > 0, mean, 1)))
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, raw["wrench"], 0)
+    friction, max_force = jnp.where(there, raw["friction"], 1), jnp.where(there, raw["max_force"], 1)
     return Grasps(
         valid=valid,
         present=there.astype(dtype),
-        friction=jnp.where(there, raw["friction"], 1),
-        max_force=jnp.where(there, raw["max_force"], 1),
+        friction=friction,
+        max_force=max_force,
         length=length,
         units=units,
         columns=grasp_columns(positions / length, frames),
@@ -251,7 +282,39 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
         weight_roots=weight_roots,
         margin=margin,
         smoothing=smoothing,
+        actuated=_actuated(raw, there, valid, length, friction, max_force) if "jacobian" in raw else None,
     )
+
+
+def _sound_actuation(raw: dict[str, jax.Array], active: jax.Array) -> jax.Array:
+    """Whether everything that is used is finite, and no limits cross, (*lanes)."""
+    if "jacobian" not in raw:
+        return jnp.array(True)
+    sound = (jnp.isfinite(raw["jacobian"]).all((1, 2)) | ~active).all(0)
+    for name in _TRANSMISSION & set(raw):
+        sound &= jnp.isfinite(raw[name]).all((0, 1))
+    return sound & ((raw["lower"] <= raw["upper"]) & (raw["lower"] < jnp.inf) & (raw["upper"] > -jnp.inf)).all(0)
+
+
+def _actuated(
+    raw: dict[str, jax.Array],
+    there: jax.Array,
+    valid: jax.Array,
+    length: jax.Array,
+    friction: jax.Array,
+    max_force: jax.Array,
+) -> Actuated:
+    jacobian = jnp.where(there[:, None, None], raw["jacobian"], 0)
+    sane = {name: jnp.where(valid, raw[name], 0) for name in _TRANSMISSION & set(raw)}
+    actuated = Actuated(
+        joints=jnp.moveaxis(jacobian, (2, 1, 0), (0, 1, 2)) / length,
+        transmission=sane["transmission"] / length,
+        inverse=sane["inverse"] * length,
+        unreached=sane.get("unreached"),
+        lower=jnp.where(valid, raw["lower"], -1),
+        upper=jnp.where(valid, raw["upper"], 1),
+    )
+    return limited(actuated, friction, jnp.where(there, max_force, 0))
 
 
 def _rotations(frames: jax.Array) -> jax.Array:

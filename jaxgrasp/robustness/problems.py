@@ -9,7 +9,7 @@ from jax import lax
 from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.program import Program
-from jaxgrasp.solvers.block_kkt import Rows
+from jaxgrasp.solvers.block_kkt import Blocks, Rows
 from jaxgrasp.solvers.effort_problem import EffortProblem
 from jaxgrasp.solvers.margin_problem import MarginProblem
 
@@ -19,7 +19,7 @@ _REFINEMENTS = {"float64": 0, "float32": 1}
 def margin_problem(program: Program) -> MarginProblem:
     """(21)."""
     refinements = _REFINEMENTS[program.rhs.dtype.name]
-    return MarginProblem((program.blocks,), program.rhs, program.dropped, program.radius, refinements)
+    return MarginProblem(program.groups, program.rhs, program.dropped, program.radius, refinements)
 
 
 class Effort(NamedTuple):
@@ -32,8 +32,8 @@ class Effort(NamedTuple):
 
 def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort:
     """(22)."""
-    blocks, dtype = program.blocks, program.rhs.dtype
-    sigma = jnp.where(program.undisturbed, 0, blocks.sigma)
+    blocks, *others = program.groups
+    dtype = program.rhs.dtype
     wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.margin / program.scale)
     eye = jnp.eye(3, dtype=dtype)[..., None, None]
     # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
@@ -41,8 +41,13 @@ def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort
     root = root * jnp.stack([program.tangential, program.tangential, program.normal]) * blocks.present
     largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
     largest = jnp.where(largest > 0, largest, 1)
+
+    def held(group: Blocks, hessian: jax.Array) -> Blocks:
+        return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * wanted, hessian=hessian)
+
     problem = EffortProblem(
-        (blocks._replace(h=blocks.h - sigma * wanted, hessian=root / largest),),
+        # The actuators' efforts cost nothing.
+        (held(blocks, root / largest), *[held(g, jnp.zeros_like(g.present)[None, None]) for g in others]),
         program.rhs,
         program.dropped,
         program.radius,

@@ -18,6 +18,7 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, whitened
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.fence import fenced
+from jaxgrasp.robustness.efforts import EffortRows, effort_unit, joined_rows, packed, unpacked
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.worst_case import reaches_outside, worst_rows
 from jaxgrasp.solvers.block_kkt import Blocks
@@ -34,7 +35,7 @@ class Program:
     cone_edges: int = field(metadata={"static": True})
     """n_e."""
     columns: jax.Array
-    """(6, 3, n, *lanes), the orthonormal rows of G; zero where dropped or absent."""
+    """(eq, 3, n, *lanes), the orthonormal equality rows, those of G and of J'f - B u; zero where dropped or absent."""
     sigma: jax.Array
     """(n_e + 1, n, *lanes), what the disturbances take from the rows of C and E, scaled."""
     h: jax.Array
@@ -42,9 +43,9 @@ class Program:
     present: jax.Array
     """(n, *lanes), 1 or 0."""
     rhs: jax.Array
-    """(6, *lanes), coordinates of b in the orthonormal rows; zero where dropped."""
+    """(eq, *lanes), coordinates of b in the orthonormal rows; zero where dropped."""
     dropped: jax.Array
-    """(6, *lanes), 1 where a row of G was dropped."""
+    """(eq, *lanes), 1 where a row was dropped."""
     scale: jax.Array
     """Lambda, (*lanes), N per unit of disturbance."""
     tangential: jax.Array
@@ -52,7 +53,7 @@ class Program:
     normal: jax.Array
     """F, (n, *lanes), N."""
     basis: Basis
-    """Row operations from G in newtons to the orthonormal rows, for forces in units of `mean`."""
+    """Row operations from the rows in newtons to the orthonormal ones, for forces in units of `mean`."""
     mean: jax.Array
     """Mean of F, (*lanes), N."""
     rank: jax.Array
@@ -67,6 +68,16 @@ class Program:
     """bool (*lanes): b is outside the range of G."""
     slippery: jax.Array
     """bool (*lanes): a contact without friction has to bear tangential force, so the margin cannot be positive."""
+
+    efforts: EffortRows | None
+    """What the actuators add."""
+    joint_sizes: jax.Array | None
+    """(n_v, *lanes), what the rows of J'f - B u were divided by."""
+
+    @property
+    def groups(self) -> tuple[Blocks, ...]:
+        """The contacts, and the actuators where there are any."""
+        return (self.blocks,) if self.efforts is None else (self.blocks, self.efforts.blocks)
 
     @property
     def blocks(self) -> Blocks:
@@ -98,9 +109,16 @@ class Program:
 
     def wrench_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
         """Multipliers of G f = b (6, *lanes) from those of the orthonormal rows, per unit of the scaled objective."""
+        return self._row_multipliers(y)[:6] * units
+
+    def joint_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array | None:
+        """The same of J'f - B u = 0, (n_v, *lanes)."""
+        return None if self.joint_sizes is None else self._row_multipliers(y)[6:] / self.joint_sizes * units[5]
+
+    def _row_multipliers(self, y: jax.Array) -> jax.Array:
         kept = self.basis.kept * y
-        terms = [self.basis.operations[r] * kept[r] for r in range(6)]
-        return fold(jnp.add, terms) / self.mean * units
+        terms = [row * k for row, k in zip(self.basis.operations, kept, strict=True)]
+        return fold(jnp.add, terms) / self.mean
 
     def wrench_multipliers_adjoint(self, y: jax.Array, units: jax.Array) -> jax.Array:
         """The transpose of `wrench_multipliers`."""
@@ -111,39 +129,58 @@ class Program:
 def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     """Scale the programs of a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
-    cone, bound, basis = worst_rows(grasps, cone_edges)
+    cone, bound, effort, basis = worst_rows(grasps, cone_edges)
     tangential = jnp.maximum(grasps.friction, _LEAST_FRICTION[dtype.name]) * grasps.max_force
     normal = grasps.max_force
 
     @fenced
     def scale_rows(
-        cone: jax.Array, bound: jax.Array, tangential: jax.Array, normal: jax.Array, reserve: jax.Array
+        cone: jax.Array,
+        bound: jax.Array,
+        effort: jax.Array | None,
+        tangential: jax.Array,
+        normal: jax.Array,
+        reserve: jax.Array,
     ) -> tuple:
-        sigma = jnp.concatenate([cone / tangential, (bound / normal)[None]])
-        largest = fold(jnp.maximum, fold(jnp.maximum, sigma))
+        sigmas = [jnp.concatenate([cone / tangential, (bound / normal)[None]])]
+        if effort is not None:
+            sigmas.append(effort)
+        largest = fold(jnp.maximum, [fold(jnp.maximum, fold(jnp.maximum, sigma)) for sigma in sigmas])
         undisturbed = largest == 0
         # A choice of units, like the mean below: no derivative depends on it.
         scale = lax.stop_gradient(1 / jnp.where(undisturbed, 1, largest))
-        sigma = jnp.where(undisturbed, present, sigma * scale)
+        ones = [present, 1]
+        sigmas = [jnp.where(undisturbed, one, sigma * scale) for one, sigma in zip(ones, sigmas, strict=False)]
         # What is left of a zero after rounding is a zero.
-        sigma = jnp.where(sigma > 8 * jnp.finfo(dtype).eps, sigma, 0)
+        sigmas = [jnp.where(sigma > 8 * jnp.finfo(dtype).eps, sigma, 0) for sigma in sigmas]
         lost = jnp.where(present > 0, -reserve / tangential, 1)
         h = jnp.concatenate([jnp.broadcast_to(lost, cone.shape), jnp.ones_like(bound)[None]])
-        return sigma, h, scale, undisturbed
+        return sigmas, h, scale, undisturbed
 
-    sigma, h, scale, undisturbed = scale_rows(cone, bound, tangential, normal, grasps.reserve)
+    unit = None if grasps.actuated is None else effort_unit(grasps.actuated)
+    effort = None if effort is None else effort / unit
+    sigmas, h, scale, undisturbed = scale_rows(cone, bound, effort, tangential, normal, grasps.reserve)
     mean = fold(jnp.add, normal * present) / jnp.maximum(fold(jnp.add, present), 1)
     mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
-    columns = grasps.columns * (jnp.stack([tangential, tangential, normal]) / mean)
-    rows = whitened(columns)
+    scales = jnp.stack([tangential, tangential, normal]) / mean
     wrench = grasps.wrench / mean
+    if grasps.actuated is None:
+        rows = whitened(grasps.columns * scales)
+        columns, efforts, sizes = rows.rows, None, None
+    else:
+        joined = joined_rows(grasps.actuated, grasps.columns * scales, scales, unit / mean)
+        rows, sizes = whitened(packed(joined)), joined.sizes
+        columns, effort_columns = unpacked(rows.rows, present.shape[0], unit.shape[0])
+        limits = jnp.stack([grasps.actuated.upper, -grasps.actuated.lower]) / unit
+        efforts = EffortRows(effort_columns, sigmas[1], limits, unit)
+        wrench = jnp.concatenate([wrench, jnp.zeros_like(sizes)])
     coordinates, kept = rows.coordinates(wrench), rows.kept
     largest = fold(jnp.maximum, jnp.abs(wrench))
     outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > 10 * RANK_TOLERANCE[dtype.name] * largest
     return Program(
         cone_edges=cone_edges,
-        columns=rows.rows,
-        sigma=sigma,
+        columns=columns,
+        sigma=sigmas[0],
         h=h,
         present=present,
         rhs=coordinates * kept,
@@ -153,12 +190,14 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         normal=normal,
         basis=rows,
         mean=mean,
-        rank=fold(jnp.add, basis.kept).astype(jnp.int32),
+        rank=fold(jnp.add, basis.kept[:6]).astype(jnp.int32),
         doubtful=_doubtful(basis),
         undisturbed=undisturbed,
         disturbance_outside=reaches_outside(grasps, basis),
         wrench_outside=outside,
         slippery=((grasps.friction <= 0) & (fold(jnp.maximum, cone) > 0)).any(0),
+        efforts=efforts,
+        joint_sizes=sizes,
     )
 
 

@@ -44,6 +44,12 @@ class Solution:
     """z >= 0 of -E f_0 + S_2 lambda <= f_max."""
     wrench_multipliers: Float[Array, "*batch 6"]
     """y of G f_0 = b: how the optimum changes with b, for (21) d margin / d b, for (22) -d effort / d b."""
+    actuator_efforts: Float[Array, "*batch actuators"] | None = None
+    """u with J'f_0 = B u, N or N m; None without actuation."""
+    actuator_multipliers: Float[Array, "*batch actuators 2"] | None = None
+    """z >= 0 of the worst case of u <= u_max and of -u <= -u_min."""
+    joint_multipliers: Float[Array, "*batch joints"] | None = None
+    """y of J'f_0 - B u = 0."""
 
     def forces_in_object_frame(self, contacts: Contacts) -> Float[Array, "*batch contacts 3"]:
         """Forces of the fingers on the object in the object frame, N.

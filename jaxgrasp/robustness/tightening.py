@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from jaxgrasp.arrays import fold
+from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
@@ -20,7 +21,7 @@ from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_probl
 from jaxgrasp.robustness.program import Program, prepared
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.block_kkt import Record
+from jaxgrasp.solvers.block_kkt import Record, Rows
 from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.status import Status
 
@@ -52,6 +53,7 @@ def largest_disturbance(
     cone_edges: int = 8,
     cone_margin: ArrayLike = 0.0,
     smoothing: ArrayLike | None = None,
+    actuation: Actuation | None = None,
 ) -> Solution:
     """The robustness margin (21): the largest factor by which the disturbances may be scaled while the grasp holds.
 
@@ -71,6 +73,9 @@ def largest_disturbance(
         smoothing: kappa (*batch,), > 0, in units of the margin: answer with the central point, where s z = kappa in
             every row, instead of the optimum. Margin and forces are then smooth and unique, and the margin is below
             the optimum by about kappa for every active row. None is the exact optimum.
+        actuation: what the hand can do: efforts u with J'f_0 = B u that stay within their limits while the worst
+            disturbance acts join the unknowns, and G* leaves joint directions that no actuator reaches without torque.
+            None lets every finger push at will.
 
     Returns:
         Solution with `*batch` axes. `margin` is attained by `forces`, and no forces reach more than `upper_bound`.
@@ -98,6 +103,7 @@ def largest_disturbance(
         compliance=compliance,
         cone_margin=cone_margin,
         smoothing=smoothing,
+        actuation=actuation,
     )
 
 
@@ -111,6 +117,7 @@ def least_effort(
     cone_edges: int = 8,
     cone_margin: ArrayLike = 0.0,
     smoothing: ArrayLike | None = None,
+    actuation: Actuation | None = None,
 ) -> Solution:
     """The tightening forces of least effort that give a chosen margin, program (22).
 
@@ -129,6 +136,7 @@ def least_effort(
         cone_margin: d (*batch,), N, >= 0.
         smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the
             effort, this program's objective. None is the exact optimum.
+        actuation: what the hand can do, as in `largest_disturbance`; actuator efforts cost nothing.
 
     Returns:
         Solution; `margin` is what `forces` certify, at least the one asked for up to rounding, `upper_bound` that of
@@ -157,6 +165,7 @@ def least_effort(
         effort_weights=effort_weights,
         margin=margin,
         smoothing=smoothing,
+        actuation=actuation,
     )
 
 
@@ -219,7 +228,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     settings = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     # Without a load, no forces at all are an answer with margin 0, exactly.
-    idle = (outcome.record.lower < 0) & (program.rhs == 0).all(0) & (grasps.reserve == 0)
+    idle = (outcome.record.lower < 0) & _unloaded(grasps, program)
     record = outcome.record._replace(
         lower=jnp.where(idle, 0, outcome.record.lower),
         x=tuple(jnp.where(idle, 0, x) for x in outcome.record.x),
@@ -256,6 +265,11 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     # Where the program's optimum is not the margin, its multipliers say nothing.
     told = ~(program.disturbance_outside | program.undisturbed | program.slippery & (low > 0))
     multipliers = jnp.where(told, record.z[0] * scale / program.row_units(), 0)
+    actuated = _actuated(program, record.x, record.z, record.y, grasps.units, scale)
+    actuated = {
+        name: jnp.where(answered, value, jnp.nan) if name == "actuator_efforts" else jnp.where(told, value, 0)
+        for name, value in actuated.items()
+    }
     solution = Solution(
         margin=margin,
         upper_bound=upper,
@@ -270,6 +284,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
         cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
         bound_multipliers=multipliers[-1],
         wrench_multipliers=jnp.where(told, program.wrench_multipliers(record.y, grasps.units) * scale, 0),
+        **actuated,
     )
     if grasps.smoothing is None:
         return solution, record
@@ -277,12 +292,32 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     return _at_centre(grasps, program, outcome.iterate, solution, grasps.valid & possible), record
 
 
+def _unloaded(grasps: Grasps, program: Program) -> jax.Array:
+    """Where no forces at all meet every row, but for the disturbances."""
+    idle = (program.rhs == 0).all(0) & (grasps.reserve == 0)
+    return idle if program.efforts is None else idle & (program.efforts.h >= 0).all((0, 1))
+
+
+def _actuated(program: Program, x: Rows, z: Rows, y: jax.Array, units: jax.Array, unit: jax.Array) -> dict:
+    """The part of a solution that comes with actuators: efforts, and multipliers for an objective in `unit`."""
+    if program.efforts is None:
+        return {}
+    return {
+        "actuator_efforts": x[1][0] * program.efforts.unit,
+        "actuator_multipliers": jnp.moveaxis(z[1] / program.efforts.unit, 0, 1) * unit,
+        "joint_multipliers": program.joint_multipliers(y, units) * unit,
+    }
+
+
 def _towards_centre(settings: Settings, grasps: Grasps, program: Program, unit: jax.Array) -> Settings:
     """Where smoothing is asked for, the loop aims at the central point, whose gap is kappa for every row."""
     if grasps.smoothing is None:
         return settings
     kappa = central_kappa(grasps, program, unit)
-    gap = kappa * program.sigma.shape[0] * fold(jnp.add, grasps.present)
+    rows = program.sigma.shape[0] * fold(jnp.add, grasps.present)
+    if program.efforts is not None:
+        rows = rows + program.efforts.h.shape[0] * program.efforts.h.shape[1]
+    gap = kappa * rows
     return settings._replace(gap_floor=1.5 * gap, mu_floor=kappa)
 
 
@@ -300,7 +335,7 @@ def _at_centre(grasps: Grasps, program: Program, iterate: Iterate, solution: Sol
 
 
 def _largest(rows: tuple) -> jax.Array:
-    return fold(jnp.maximum, fold(jnp.maximum, jnp.abs(rows[0])))
+    return fold(jnp.maximum, [fold(jnp.maximum, fold(jnp.maximum, jnp.abs(group))) for group in rows])
 
 
 def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Record) -> Solution:
@@ -321,7 +356,7 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     problem = replace(problem, guess=tuple(share * x + (1 - share) * c for x, c in zip(record.x, centre, strict=True)))
     active = grasps.valid & ~program.wrench_outside & held & (first.status != Status.INFEASIBLE)
     # Without a load and a margin no forces at all are the answer, exactly.
-    idle = active & (fold(jnp.maximum, jnp.abs(program.rhs)) == 0) & (wanted == 0) & (grasps.reserve == 0)
+    idle = active & _unloaded(grasps, program) & (wanted == 0)
     outcome = interior_point.solve(problem, settings, active & ~idle)
     best = jax.tree.map(lambda x: jnp.where(idle, 0, x), outcome.record)
     gap = (best.upper - best.lower) / problem.gap_scale(best)
@@ -353,7 +388,10 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
         cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
         bound_multipliers=multipliers[-1],
         wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * unit**2,
+        **_actuated(program, best.x, best.z, best.y, grasps.units, unit**2),
     )
+    if program.efforts is not None:
+        solution = replace(solution, actuator_efforts=hide(solution.actuator_efforts))
     if grasps.smoothing is None:
         return solution
     return _at_centre(grasps, program, outcome.iterate, solution, active & ~idle)

@@ -21,6 +21,7 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.sets import furthest, support
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.fence import each, fenced
+from jaxgrasp.robustness.efforts import effort_reach
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import OfPyramids, Plain
 
@@ -52,31 +53,46 @@ def worst_case(
 
 class _WorstCase(OfPyramids, Plain):
     def evaluate(self, grasps: Grasps) -> tuple[jax.Array, jax.Array]:
-        cone, bound, _ = worst_rows(grasps, self.cone_edges)
+        cone, bound, *_ = worst_rows(grasps, self.cone_edges)
         hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)  # noqa: E731
         return hide(jnp.moveaxis(-cone, 0, 1)), hide(bound)
 
 
-def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, Basis]:
-    """-S_1 (n_e, n, *lanes), S_2 (n, *lanes) and the basis of G's rows; lanes trail."""
-    inverse, basis = pseudo_inverse(grasps.columns, grasps.half)
+def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, jax.Array | None, Basis]:
+    """-S_1 (n_e, n, *lanes), S_2 (n, *lanes), the same of efforts (2, n_u, *lanes), and a basis of the rows.
+
+    None for efforts without actuators; the basis is that of the rows of G, and of N'J'.
+    """
+    inverse, basis = pseudo_inverse(grasps.rows, grasps.half)
+    efforts = None
     if grasps.vertex_halves is None:
         reach = fenced(support)(grasps.terms, _directions(inverse, grasps.friction, grasps.units, cone_edges))
+        if grasps.actuated is not None:
+            efforts = fenced(support)(grasps.terms, effort_reach(grasps.actuated, inverse[:, :6], grasps.units))
     else:
 
-        def worse(reach: jax.Array, vertex: tuple) -> tuple[jax.Array, None]:
+        def worse(reach: tuple, vertex: tuple) -> tuple[tuple, None]:
             half, wrench = vertex
-            rows = _directions(pseudo_inverse(grasps.columns, half)[0], grasps.friction, grasps.units, cone_edges)
-            return jnp.maximum(reach, fold(jnp.add, rows * wrench[:, None, None])), None
+            inverse = pseudo_inverse(grasps.rows, half)[0]
+            rows = [_directions(inverse, grasps.friction, grasps.units, cone_edges)]
+            if grasps.actuated is not None:
+                rows.append(effort_reach(grasps.actuated, inverse[:, :6], grasps.units))
+            pulls = [fold(jnp.add, row * wrench[:, None, None]) for row in rows]
+            return tuple(jnp.maximum(r, p) for r, p in zip(reach, pulls, strict=True)), None
 
-        reach = jnp.zeros((cone_edges + 1, *grasps.present.shape), grasps.present.dtype)
-        reach, _ = lax.scan(worse, reach, (grasps.vertex_halves, grasps.terms[0].wrenches))
+        lanes = grasps.length.shape
+        shapes = [(cone_edges + 1, *grasps.present.shape)]
+        if grasps.actuated is not None:
+            shapes.append((2, grasps.actuated.transmission.shape[1], *lanes))
+        none = tuple(jnp.zeros(shape, grasps.present.dtype) for shape in shapes)
+        (reach, *rest), _ = lax.scan(worse, none, (grasps.vertex_halves, grasps.terms[0].wrenches))
+        efforts = rest[0] if rest else None
     reach = jnp.where(grasps.present > 0, reach, 0)
-    return reach[:-1], reach[-1], basis
+    return reach[:-1], reach[-1], efforts, basis
 
 
 def _directions(inverse: jax.Array, friction: jax.Array, units: jax.Array, cone_edges: int) -> jax.Array:
-    """Wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6, n, *lanes)."""
+    """Wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6 or more, n, *lanes)."""
 
     @fenced
     def spread(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
@@ -87,7 +103,7 @@ def _directions(inverse: jax.Array, friction: jax.Array, units: jax.Array, cone_
             cone = -(c * inverse[0] + s * inverse[1] + (k * friction) * inverse[2])
             return jnp.concatenate([cone, inverse[2:]]) * unit
 
-        return each(component, (jnp.moveaxis(inverse, 1, 0), units))
+        return each(component, (jnp.moveaxis(inverse[:, :6], 1, 0), units))
 
     return spread(inverse, friction, units)
 
@@ -161,7 +177,8 @@ def reaches_outside(grasps: Grasps, basis: Basis) -> jax.Array:
 
     def measure() -> jax.Array:
         size = sum(fold(jnp.maximum, extent * grasps.units) for extent in grasps.extents)
-        outside = jnp.moveaxis(jnp.where(basis.kept[:, None] > 0, 0, basis.operations), 0, 1) * grasps.units[:, None]
+        dropped = jnp.where(basis.kept[:, None] > 0, 0, basis.operations[:, :6])
+        outside = jnp.moveaxis(dropped, 0, 1) * grasps.units[:, None]
         reach = support(grasps.terms, jnp.concatenate([outside, -outside], 1))
         return fold(jnp.maximum, reach) > tolerance * size
 

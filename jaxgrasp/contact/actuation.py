@@ -1,0 +1,99 @@
+"""What the joints and actuators of a hand transmit to its contacts."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxgrasp.arrays import as_float, broadcast_batch
+
+# Singular values of B below this share of the largest count as zero.
+_RANK_TOLERANCE = 1e-6
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Actuation:
+    """Contact Jacobians, transmission and limits of a hand's actuators: which contact forces the hand can produce.
+
+    Statically, joint torques J'f balance the reactions to the contact forces f, and come from actuator efforts u:
+    J'f = B u with u_min <= u <= u_max. Joint directions that no actuator reaches, N'B = 0, bear nothing: N'J'f = 0.
+    While a disturbance acts, of all efforts with B u = J'f the smallest answer it, u = B^+ J'f. Make one with
+    `from_jacobian`.
+    """
+
+    jacobian: Float[Array, "*batch contacts 3 joints"]
+    """J, velocity of each contact point on the hand in its contact frame, per unit of joint velocity; m/rad or 1."""
+    transmission: Float[Array, "*batch joints actuators"]
+    """B, joint torque or force per unit of effort."""
+    lower: Float[Array, "*batch actuators"]
+    """u_min, in units of effort (N or N m); -inf where unlimited."""
+    upper: Float[Array, "*batch actuators"]
+    """u_max; inf where unlimited."""
+    inverse: Float[Array, "*batch actuators joints"]
+    """B^+."""
+    unreached: Float[Array, "*batch directions joints"] | None
+    """N', rows that span what B does not reach (there may be more rows than directions); None where B reaches all."""
+
+    @classmethod
+    def from_jacobian(
+        cls, jacobian: ArrayLike, transmission: ArrayLike, lower: ArrayLike, upper: ArrayLike
+    ) -> "Actuation":
+        """Actuation from Jacobians and transmission.
+
+        Args:
+            jacobian: J (*batch, n_c, 3, n_v), contact frames.
+            transmission: B (*batch, n_v, n_u). One that all grasps share, known while tracing, is best: the number of
+                directions without an actuator is then known, too.
+            lower: u_min (*batch, n_u); may be -inf.
+            upper: u_max (*batch, n_u); may be inf.
+
+        Raises:
+            ValueError: shapes that do not fit. Limits that cross or are NaN make their grasp
+                `Status.INVALID_INPUT`.
+        """
+        jacobian = as_float("jacobian", jacobian, ("n_c", 3, "n_v"))
+        joints, dtype = jacobian.shape[-1], jacobian.dtype
+        given = as_float("transmission", transmission, (joints, "n_u"))
+        lower, upper = (
+            as_float(name, limit, (given.shape[-1],)) for name, limit in (("lower", lower), ("upper", upper))
+        )
+        broadcast_batch(
+            jacobian=jacobian.shape[:-3],
+            transmission=given.shape[:-2],
+            lower=lower.shape[:-1],
+            upper=upper.shape[:-1],
+        )
+        if given.ndim == 2 and not isinstance(transmission, jax.core.Tracer):
+            left, values, right = np.linalg.svd(np.asarray(transmission, np.float64))
+            rank = int(np.sum(values > _RANK_TOLERANCE * max(values.max(initial=0), np.finfo(float).tiny)))
+            inverse = jnp.asarray((right[:rank].T / values[:rank]) @ left[:, :rank].T, dtype)
+            unreached = jnp.asarray(left[:, rank:].T, dtype) if rank < joints else None
+        else:
+            inverse = jnp.linalg.pinv(given, rtol=_RANK_TOLERANCE)
+            unreached = jnp.eye(joints, dtype=given.dtype) - given @ inverse
+        return cls(
+            jacobian=jacobian,
+            transmission=given.astype(dtype),
+            lower=lower.astype(dtype),
+            upper=upper.astype(dtype),
+            inverse=inverse.astype(dtype),
+            unreached=None if unreached is None else unreached.astype(dtype),
+        )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """The leading axes that all leaves broadcast to."""
+        return jnp.broadcast_shapes(
+            self.jacobian.shape[:-3],
+            self.transmission.shape[:-2],
+            self.lower.shape[:-1],
+            self.upper.shape[:-1],
+        )
+
+    def joint_torques(self, forces: Float[Array, "*batch contacts 3"]) -> Float[Array, "*batch joints"]:
+        """J'f: the joint torques that put the forces (*batch, n_c, 3), N, contact frames, on the object; N m or N."""
+        return jnp.einsum("...iav,...ia->...v", self.jacobian, forces)

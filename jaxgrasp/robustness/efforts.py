@@ -1,0 +1,164 @@
+"""What a hand's actuators add to (21) and (22): their efforts u as unknowns, J'f = B u, and limits under disturbance.
+
+While the disturbance w acts, contact forces change by -lambda G* w and efforts by -lambda A G* w with A = B^+ J', so
+the worst case of u <= u_max and -u <= -u_min is again a support function: h_D(-A G*) and h_D(A G*), row by row. G* is
+that of G and N'J' stacked: directions that no actuator reaches stay without torque.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxgrasp.arrays import fold, literal
+from jaxgrasp.fence import each, fenced
+from jaxgrasp.solvers.block_kkt import Blocks
+
+# Rows shorter than this, in units of the others, are zero but for rounding.
+_NOTHING = {"float64": 1e-12, "float32": 1e-5}
+
+
+class Actuated(NamedTuple):
+    """`Actuation` in lanes (trailing; some leaves may be shared, with lanes of size 1)."""
+
+    joints: jax.Array
+    """(n_v, 3, n, *lanes), J' divided by the length unit of `Grasps`; zero for absent contacts."""
+    transmission: jax.Array
+    """(n_v, n_u, *lanes), B divided by the length unit."""
+    inverse: jax.Array
+    """(n_u, n_v, *lanes), B^+ times the length unit."""
+    unreached: jax.Array | None
+    """(r, n_v, *lanes), N'; None where every joint direction is reached."""
+    lower: jax.Array
+    """(n_u, *lanes), u_min, finite."""
+    upper: jax.Array
+    """(n_u, *lanes), u_max, finite."""
+
+
+class EffortRows(NamedTuple):
+    """The efforts' part of the scaled program; lanes trail.
+
+    columns: (eq, 1, n_u, *lanes), of the orthonormal equality rows.
+    sigma, h: (2, n_u, *lanes), of u <= u_max and -u <= -u_min, scaled.
+    unit: (n_u, *lanes), effort per unit of unknown.
+    """
+
+    columns: jax.Array
+    sigma: jax.Array
+    h: jax.Array
+    unit: jax.Array
+
+    @property
+    def blocks(self) -> Blocks:
+        """One unknown a block, with two rows."""
+        return Blocks(
+            patterns=literal(np.array([[1.0], [-1.0]]), self.h.dtype),
+            columns=self.columns,
+            sigma=self.sigma,
+            h=self.h,
+            present=jnp.ones_like(self.unit),
+            hessian=None,
+            start=literal(np.zeros(1), self.h.dtype),
+        )
+
+
+def effort_unit(actuated: Actuated) -> jax.Array:
+    """What the efforts are scaled by, (n_u, *lanes): their larger limit."""
+    largest = lax.stop_gradient(jnp.maximum(jnp.abs(actuated.upper), jnp.abs(actuated.lower)))
+    # An actuator without any effort is as good as one with hardly any.
+    return jnp.maximum(largest, 1e-6 * jnp.maximum(fold(jnp.maximum, largest), 1e-6))
+
+
+def limited(actuated: Actuated, friction: jax.Array, max_force: jax.Array) -> Actuated:
+    """Limits beyond what bounded forces can ever ask for, infinite ones for example, brought down to that.
+
+    With |f_t| <= mu f_max and |f_n| <= f_max in every contact, no effort needs to be larger.
+    """
+    reach = jnp.stack([friction, friction, jnp.ones_like(friction)]) * max_force
+    torque = jnp.einsum("van...,an...->v...", jnp.abs(actuated.joints), reach)
+    needed = jnp.einsum("uv...,v...->u...", jnp.abs(actuated.inverse), torque)
+    # Where actuators oppose each other, one may have to make up for all the others.
+    direct = jnp.abs(actuated.transmission)
+    alone = fold(jnp.maximum, torque[:, None] / jnp.where(direct > 0, direct, jnp.inf))
+    most = lax.stop_gradient(jnp.maximum(needed, alone))
+    return actuated._replace(
+        upper=jnp.minimum(actuated.upper, jnp.maximum(most, actuated.lower)),
+        lower=jnp.maximum(actuated.lower, -jnp.maximum(most, -actuated.upper)),
+    )
+
+
+def stacked_rows(columns: jax.Array, actuated: Actuated | None) -> jax.Array:
+    """G (6, 3, n, *lanes), and below it N'J' where actuators do not reach every joint direction."""
+    if actuated is None or actuated.unreached is None:
+        return columns
+    bare = jnp.einsum("rv...,van...->ran...", actuated.unreached, actuated.joints)
+    return jnp.concatenate([columns, bare])
+
+
+def effort_reach(actuated: Actuated, inverse: jax.Array, units: jax.Array) -> jax.Array:
+    """Wrenches -A G*, then A G*: (6, 2, n_u, *lanes) from G* (3, 6, n, *lanes)."""
+
+    @fenced
+    def spread(inverse: jax.Array) -> jax.Array:
+        def component(one: tuple) -> jax.Array:
+            column, unit = one
+            torque = jnp.einsum("van...,an...->v...", actuated.joints, column)
+            effort = jnp.einsum("uv...,v...->u...", actuated.inverse, torque) * unit
+            return jnp.stack([-effort, effort])
+
+        return each(component, (jnp.moveaxis(inverse, 1, 0), units))
+
+    return spread(inverse)
+
+
+class Joined(NamedTuple):
+    """The equality rows of forces and efforts together, before they are made orthonormal.
+
+    forces: (6 + n_v, 3, n, *lanes), of G f = b and J'f - B u = 0 for scaled forces.
+    efforts: (6 + n_v, 1, n_u, *lanes).
+    sizes: (n_v, *lanes), what the joints' rows were divided by.
+    """
+
+    forces: jax.Array
+    efforts: jax.Array
+    sizes: jax.Array
+
+
+def joined_rows(actuated: Actuated, columns: jax.Array, scales: jax.Array, unit: jax.Array) -> Joined:
+    """The rows of G f = b and of J'f - B u = 0.
+
+    Args:
+        actuated: the hand.
+        columns: (6, 3, n, *lanes), those of G for scaled forces.
+        scales: (3, n, *lanes), what the forces are scaled by.
+        unit: (n_u, *lanes), what the efforts are.
+    """
+    torque = actuated.joints * scales
+    effort = -actuated.transmission * unit
+    squares = fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(torque**2, 1, 0)), 1, 0))
+    sizes = lax.stop_gradient(jnp.sqrt(squares + fold(jnp.add, jnp.moveaxis(effort**2, 1, 0))))
+    sizes = jnp.where(sizes > _NOTHING[sizes.dtype.name], sizes, 1)
+    effort = jnp.broadcast_to(effort / sizes[:, None], (*effort.shape[:2], *sizes.shape[1:]))
+    return Joined(
+        forces=jnp.concatenate([columns, torque / sizes[:, None, None]]),
+        efforts=jnp.concatenate([jnp.zeros((6, *effort.shape[1:]), effort.dtype), effort])[:, None],
+        sizes=sizes,
+    )
+
+
+def packed(rows: Joined) -> jax.Array:
+    """Both kinds of unknown as blocks of three, (eq, 3, n + ceil(n_u / 3), *lanes), for `whitened`."""
+    efforts = rows.efforts[:, 0]
+    spare = -efforts.shape[1] % 3
+    padded = jnp.concatenate([efforts, jnp.zeros((efforts.shape[0], spare, *efforts.shape[2:]), efforts.dtype)], 1)
+    blocks = padded.reshape(padded.shape[0], -1, 3, *padded.shape[2:])
+    return jnp.concatenate([rows.forces, jnp.moveaxis(blocks, 2, 1)], 2)
+
+
+def unpacked(rows: jax.Array, contacts: int, actuators: int) -> tuple[jax.Array, jax.Array]:
+    """Of packed rows, the columns of forces (eq, 3, n, *lanes) and of efforts (eq, 1, n_u, *lanes)."""
+    blocks = jnp.moveaxis(rows[:, :, contacts:], 1, 2)
+    efforts = blocks.reshape(rows.shape[0], -1, *rows.shape[3:])[:, :actuators]
+    return rows[:, :, :contacts], efforts[:, None]
