@@ -1,10 +1,7 @@
 """Margins that a hand can produce, against HiGHS and Clarabel with every row written out."""
 
-from dataclasses import replace
 
-import clarabel
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse

@@ -22,10 +22,10 @@ from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem, weighed
-from jaxgrasp.robustness.program import Program, prepared, scaled_program
+from jaxgrasp.robustness.program import Program, actuated_values, prepared, scaled_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
 from jaxgrasp.solvers.block_kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows, total
-from jaxgrasp.solvers.interior_point import Iterate
+from jaxgrasp.solvers.interior_point import Iterate, reduce_rows
 from jaxgrasp.solvers.sensitivity import central_point, solve_symmetric
 
 # kappa of the central points whose derivatives stand for those of the exact forces of (21) and of (22), in the solver's
@@ -46,6 +46,9 @@ class Point(NamedTuple):
     wrench_multipliers: jax.Array
     usable: jax.Array
     """bool (*lanes): where it is one."""
+    actuator_efforts: jax.Array | None = None
+    actuator_multipliers: jax.Array | None = None
+    joint_multipliers: jax.Array | None = None
 
 
 class RowWeights(NamedTuple):
@@ -74,6 +77,8 @@ class RowWeights(NamedTuple):
 def envelope_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: tuple, names: frozenset) -> Grasps:
     """The gradient of (21)'s Lagrangian with respect to the data, times a cotangent (*lanes)."""
     weight = jnp.where(point.usable, cotangents[0], 0)
+    if grasps.actuated is not None:
+        return _lagrangian_gradient(cone_edges, grasps, point, weight)
     clean = lambda x: jnp.where(point.usable, x, 0)  # noqa: E731
     force, z_cone = clean(jnp.moveaxis(point.forces, 1, 0)), clean(jnp.moveaxis(point.cone_multipliers, 1, 0))
     z_cone, z_bound = -z_cone * weight * grasps.present, -clean(point.bound_multipliers) * weight * grasps.present
@@ -140,6 +145,8 @@ class CentralPoint(OfPyramids):
 
 def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: Point, names: frozenset) -> Grasps:
     """From cotangents of a central point to those of the data: one solve with the symmetric matrix."""
+    if grasps.actuated is not None:
+        return _actuated_adjoint(cone_edges, grasps, point, cotangents)
     program = scaled_program(grasps, cone_edges)
     problem, unit = _problem(grasps, program)
     (group,), kappa = problem.groups, central_kappa(grasps, program, unit)
@@ -200,6 +207,49 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     return _to_grasps(grasps, rows, cone_edges, names)
 
 
+def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: jax.Array) -> Grasps:
+    """`envelope_adjoint` for a hand, through the scaled program by JAX's own hand."""
+    program = scaled_program(grasps, cone_edges)
+    problem, unit = _problem(grasps, program)
+    iterate = _iterate(problem, program, point, unit, None)
+
+    def value(grasps: Grasps) -> jax.Array:
+        moved = _problem(grasps, scaled_program(grasps, cone_edges))[0]
+        residuals = moved.residuals(iterate)
+        terms = jax.tree.map(jnp.multiply, (iterate.z, iterate.y), (residuals.rows, residuals.primal))
+        return -jnp.sum(weight * unit * reduce_rows(jnp.add, terms, weight.ndim))
+
+    return jax.grad(value, allow_int=True)(grasps)
+
+
+def _actuated_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: Point) -> Grasps:
+    """`_central_adjoint` for a hand, through the scaled program by JAX's own hand."""
+    program = scaled_program(grasps, cone_edges)
+    problem, unit = _problem(grasps, program)
+    iterate = _iterate(problem, program, point, unit, central_kappa(grasps, program, unit))
+
+    def read(grasps: Grasps, iterate: Iterate) -> Point:
+        return _point(grasps, scaled_program(grasps, cone_edges), iterate, unit, point.usable)._replace(usable=None)
+
+    out, pull = jax.vjp(read, grasps, iterate)
+    given = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)  # noqa: E731
+    known = {name: given(getattr(cotangents, name), like) for name, like in out._asdict().items() if like is not None}
+    direct, back = pull(out._replace(**known))
+    right_x, right_lambda = back.x if problem.bordered else (back.x, None)
+    move_x, move_lambda, move_y, move_z = solve_symmetric(
+        problem, iterate.s, iterate.z, (right_x, right_lambda, back.y, back.z)
+    )
+    moves = ((move_x, move_lambda) if problem.bordered else move_x, move_y, move_z)
+
+    def lack(grasps: Grasps) -> jax.Array:
+        residuals = _problem(grasps, scaled_program(grasps, cone_edges))[0].residuals(iterate)
+        terms = jax.tree.map(jnp.multiply, moves, (residuals.dual, residuals.primal, residuals.rows))
+        return -jnp.sum(jnp.where(point.usable, reduce_rows(jnp.add, terms, unit.ndim), 0))
+
+    indirect = jax.grad(lack, allow_int=True)(grasps)
+    return jax.tree.map(lambda a, b: a if a.dtype == jax.dtypes.float0 else a + b, direct, indirect)
+
+
 def central_kappa(grasps: Grasps, program: Program, unit: jax.Array) -> jax.Array:
     """What s z is at the central point, scaled, (*lanes), for an objective in the given unit."""
     if grasps.smoothing is not None:
@@ -228,6 +278,7 @@ def _point(grasps: Grasps, program: Program, iterate: Iterate, unit: jax.Array, 
     blocks, margin = (iterate.x, grasps.margin) if grasps.margin is not None else iterate.x
     forces = program.forces(blocks[0]) * grasps.present[:, None]
     multipliers = iterate.z[0] * unit / program.row_units()
+    actuated = actuated_values(program, blocks, iterate, grasps.units, unit)
     return Point(
         margin=margin if grasps.margin is not None else margin * program.scale,
         forces=forces,
@@ -236,6 +287,7 @@ def _point(grasps: Grasps, program: Program, iterate: Iterate, unit: jax.Array, 
         bound_multipliers=multipliers[-1],
         wrench_multipliers=program.wrench_multipliers(iterate.y, grasps.units) * unit,
         usable=usable,
+        **actuated,
     )
 
 
@@ -243,19 +295,23 @@ def _iterate(
     problem: BlockProblem, program: Program, point: Point, unit: jax.Array, kappa: jax.Array | None
 ) -> Iterate:
     """The scaled iterate; s from s z = kappa, or from the rows where kappa is None. Harmless where of no use."""
-    (group,) = problem.groups
     clean = lambda x, other: jnp.where(point.usable, x, other)  # noqa: E731
     forces = clean(jnp.moveaxis(point.forces, 1, 0), 0) * program.present
-    x = forces / jnp.stack([program.tangential, program.tangential, program.normal])
+    x = [forces / jnp.stack([program.tangential, program.tangential, program.normal])]
     z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
-    z = clean(z * program.row_units() / unit, 1) * program.present
+    z = [clean(z * program.row_units() / unit, 1) * program.present]
+    if program.efforts is not None:
+        x.append((clean(point.actuator_efforts, 0) / program.efforts.unit)[None])
+        z.append(clean(jnp.moveaxis(point.actuator_multipliers, 1, 0) * program.efforts.unit / unit, 1))
     lam = clean(point.margin, 0) / program.scale
-    if kappa is None:
-        s = group.h - apply_rows(group, x) - (group.sigma * lam if problem.bordered else 0)
-        s = jnp.where(program.present > 0, clean(s, 1), 1)
-    else:
-        s = jnp.where(program.present > 0, clean(kappa / jnp.where(program.present > 0, z, 1), 1), 1)
-    pull = adjoint_rows(group, z)
-    if group.hessian is not None:
-        pull = pull + apply_hessian(group, x)
-    return Iterate(((x,), lam) if problem.bordered else (x,), -problem.equality((pull,)), (s,), (z,))
+    s, pull = [], []
+    for group, x_g, z_g in zip(problem.groups, x, z, strict=True):
+        if kappa is None:
+            slack = group.h - apply_rows(group, x_g) - (group.sigma * lam if problem.bordered else 0)
+        else:
+            slack = kappa / jnp.where(group.present > 0, z_g, 1)
+        s.append(jnp.where(group.present > 0, clean(slack, 1), 1))
+        stationary = adjoint_rows(group, z_g)
+        pull.append(stationary if group.hessian is None else stationary + apply_hessian(group, x_g))
+    blocks, y = tuple(x), -problem.equality(tuple(pull))
+    return Iterate((blocks, lam) if problem.bordered else blocks, y, tuple(s), tuple(z))

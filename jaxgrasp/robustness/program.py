@@ -21,7 +21,8 @@ from jaxgrasp.fence import fenced
 from jaxgrasp.robustness.efforts import EffortRows, effort_unit, joined_rows, packed, unpacked
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.worst_case import reaches_outside, worst_rows
-from jaxgrasp.solvers.block_kkt import Blocks
+from jaxgrasp.solvers.block_kkt import Blocks, Record, Rows
+from jaxgrasp.solvers.interior_point import Iterate
 
 # Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
 _LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
@@ -204,6 +205,19 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
 def prepared(grasps: Grasps, cone_edges: int) -> tuple[Grasps, Program]:
     """The programs, and what else of the grasps is needed to solve them: not the disturbance set."""
     return replace(grasps, terms=(), extents=()), scaled_program(grasps, cone_edges)
+
+
+def actuated_values(
+    program: Program, x: Rows, multipliers: Record | Iterate, units: jax.Array, unit: jax.Array
+) -> dict[str, jax.Array]:
+    """The part of a solution that comes with actuators: efforts, and multipliers for an objective in `unit`."""
+    if program.efforts is None:
+        return {}
+    return {
+        "actuator_efforts": x[1][0] * program.efforts.unit,
+        "actuator_multipliers": jnp.moveaxis(multipliers.z[1] / program.efforts.unit, 0, 1) * unit,
+        "joint_multipliers": program.joint_multipliers(multipliers.y, units) * unit,
+    }
 
 
 def _doubtful(basis: Basis) -> jax.Array:

@@ -18,10 +18,10 @@ from jaxgrasp.robustness.derivatives import CentralPoint, Point, central_kappa, 
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem
-from jaxgrasp.robustness.program import Program, prepared
+from jaxgrasp.robustness.program import Program, actuated_values, prepared
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.block_kkt import Record, Rows
+from jaxgrasp.solvers.block_kkt import Record
 from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.status import Status
 
@@ -265,11 +265,10 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     # Where the program's optimum is not the margin, its multipliers say nothing.
     told = ~(program.disturbance_outside | program.undisturbed | program.slippery & (low > 0))
     multipliers = jnp.where(told, record.z[0] * scale / program.row_units(), 0)
-    actuated = _actuated(program, record.x, record.z, record.y, grasps.units, scale)
-    actuated = {
-        name: jnp.where(answered, value, jnp.nan) if name == "actuator_efforts" else jnp.where(told, value, 0)
-        for name, value in actuated.items()
-    }
+    actuated = actuated_values(program, record.x, record, grasps.units, scale)
+    for name, value in actuated.items():
+        is_primal = name == "actuator_efforts"
+        actuated[name] = jnp.where(answered, value, jnp.nan) if is_primal else jnp.where(told, value, 0)
     solution = Solution(
         margin=margin,
         upper_bound=upper,
@@ -296,17 +295,6 @@ def _unloaded(grasps: Grasps, program: Program) -> jax.Array:
     """Where no forces at all meet every row, but for the disturbances."""
     idle = (program.rhs == 0).all(0) & (grasps.reserve == 0)
     return idle if program.efforts is None else idle & (program.efforts.h >= 0).all((0, 1))
-
-
-def _actuated(program: Program, x: Rows, z: Rows, y: jax.Array, units: jax.Array, unit: jax.Array) -> dict:
-    """The part of a solution that comes with actuators: efforts, and multipliers for an objective in `unit`."""
-    if program.efforts is None:
-        return {}
-    return {
-        "actuator_efforts": x[1][0] * program.efforts.unit,
-        "actuator_multipliers": jnp.moveaxis(z[1] / program.efforts.unit, 0, 1) * unit,
-        "joint_multipliers": program.joint_multipliers(y, units) * unit,
-    }
 
 
 def _towards_centre(settings: Settings, grasps: Grasps, program: Program, unit: jax.Array) -> Settings:
@@ -388,10 +376,8 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
         cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
         bound_multipliers=multipliers[-1],
         wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * unit**2,
-        **_actuated(program, best.x, best.z, best.y, grasps.units, unit**2),
+        **{name: hide(value) for name, value in actuated_values(program, best.x, best, grasps.units, unit**2).items()},
     )
-    if program.efforts is not None:
-        solution = replace(solution, actuator_efforts=hide(solution.actuator_efforts))
     if grasps.smoothing is None:
         return solution
     return _at_centre(grasps, program, outcome.iterate, solution, active & ~idle)
