@@ -43,7 +43,7 @@ def shadow_hand(
         for finger in _COUPLED_FINGERS:
             _couple(spec, finger)
     _add_light(spec)
-    return _finish(spec, object, 0.03 if size is None else size, position=(0.34, 0.0, 0.085))
+    return _finish(spec, object, 0.03 if size is None else size, position=(0.355, -0.005, 0.08))
 
 
 def four_fingers(object: str | Path = "sphere", size: float | None = None) -> mujoco.MjSpec:
@@ -108,7 +108,7 @@ def _finish(
         raise ValueError(f"size: got {size}, wanted a positive number of metres")
     body = spec.worldbody.add_body(name="object", pos=position)
     body.add_freejoint(name="object")
-    geom = body.add_geom(name="object", mass=_MASS, rgba=(0.45, 0.65, 0.5, 1.0))
+    geom = body.add_geom(name="object", mass=_MASS, rgba=(0.86, 0.79, 0.64, 1.0))
     _shape(spec, geom, object, size)
     # The object's contact parameters count wherever it touches. It meets all masks that the hands' geoms have.
     geom.priority = 1

@@ -17,7 +17,7 @@ from jaxgrasp.viewer.ranking import write_figure
 _PIXELS = 720
 _INCHES = 4.8
 _LONGEST_ARROW = 0.04
-_HAND_ALPHA = 0.45
+_HAND_ALPHA = 0.35
 
 
 def draw_scenes(
@@ -92,12 +92,11 @@ def _for_pictures(model: mujoco.MjModel) -> mujoco.MjModel:
     model.light_active[:] = 0
     hand = ~np.isin(model.body_rootid[model.geom_bodyid], _free_bodies(model))
     # A geom with a material has its colour from there; materials may be shared with the object, geoms' colours are not.
-    materials = model.geom_matid[hand]
-    model.geom_rgba[hand] = np.where(
-        (materials >= 0)[:, None], model.mat_rgba[materials] if model.nmat else 1.0, model.geom_rgba[hand]
-    )
+    for geom in np.flatnonzero(hand).tolist():
+        material = model.geom_matid[geom]
+        colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+        model.geom_rgba[geom] = [*(0.6 * colour[:3] + 0.4), _HAND_ALPHA * colour[3]]
     model.geom_matid[hand] = -1
-    model.geom_rgba[hand, 3] *= _HAND_ALPHA
     return model
 
 
@@ -116,7 +115,7 @@ def _scene(
 
     camera = mujoco.MjvCamera()
     camera.lookat[:] = centre
-    camera.distance = 1.1 * radius / np.sin(np.radians(0.5 * model.vis.global_.fovy))
+    camera.distance = 1.25 * radius / np.sin(np.radians(0.5 * model.vis.global_.fovy))
     camera.azimuth, camera.elevation = _view(tips - tails)
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + len(drawn) + 100)
     mujoco.mjv_updateScene(
@@ -124,6 +123,7 @@ def _scene(
     )
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         scene.flags[flag] = 0
+    _add_background(scene)
     for number, tail, tip in zip(drawn.tolist(), tails, tips, strict=True):
         colour = to_rgba(CONTACT_COLOURS[number % len(CONTACT_COLOURS)])
         _add_arrow(scene, tail, tip, 0.02 * radius, colour)
@@ -132,14 +132,15 @@ def _scene(
 
 def _view(pushes: Float[np.ndarray, "arrows 3"]) -> tuple[float, float]:
     """Azimuth and elevation (degrees) of a view from above in which arrows are seen neither end on nor behind."""
-    azimuths, elevations = np.meshgrid(np.arange(0.0, 360.0, 15.0), np.arange(-70.0, -14.0, 5.0), indexing="ij")
+    azimuths, elevations = np.meshgrid(np.arange(0.0, 360.0, 15.0), np.arange(-55.0, -14.0, 5.0), indexing="ij")
     a, e = np.radians(azimuths), np.radians(elevations)
     towards_camera = -np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
     # Each arrow stands on the object's side that it pushes.
     outward = -pushes / np.linalg.norm(pushes, axis=-1, keepdims=True)
     cosine = towards_camera @ outward.T
-    in_front = np.clip((cosine + 0.5) / 0.7, 0.0, 1.0)
-    score = (in_front * np.sqrt(1.0 - np.clip(cosine, -1.0, 1.0) ** 2)).sum(-1)
+    seen = (1.0 - np.clip(-cosine, 0.0, 1.0) ** 2) * np.sqrt(1.0 - np.clip(cosine, -1.0, 1.0) ** 2)
+    # Also the worst one counts: views along one of four arrows would win by the three others.
+    score = seen.mean(-1) + seen.min(-1) if len(pushes) else -((elevations + 35.0) ** 2)
     best = np.unravel_index(np.argmax(score), score.shape)
     return float(azimuths[best]), float(elevations[best])
 
@@ -148,10 +149,30 @@ def _add_arrow(
     scene: mujoco.MjvScene, tail: np.ndarray, tip: np.ndarray, width: float, colour: tuple[float, ...]
 ) -> None:
     kind = mujoco.mjtGeom.mjGEOM_ARROW
+    geom = _add_geom(scene, kind, colour)
+    # The renderer draws an arrow half as long as its geom says.
+    mujoco.mjv_connector(geom, kind, width, tail, 2.0 * tip - tail)
+    geom.emission = 0.5
+
+
+def _add_background(scene: mujoco.MjvScene) -> None:
+    """A white wall behind everything: without a sky in the model the background is black."""
+    eye = scene.camera[0]
+    geom = _add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, (1.0, 1.0, 1.0, 1.0))
+    far = 0.9 * eye.frustum_far
+    forward, up = np.array(eye.forward, float), np.array(eye.up, float)
+    geom.pos[:] = np.array(eye.pos) + far * forward
+    geom.mat[:] = np.stack([np.cross(up, forward), up, forward], axis=-1)
+    geom.size[:] = (far, far, 1e-3 * far)
+    geom.emission = 1.0
+
+
+def _add_geom(scene: mujoco.MjvScene, kind: mujoco.mjtGeom, colour: tuple[float, ...]) -> mujoco.MjvGeom:
     geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(colour, np.float32))
-    mujoco.mjv_connector(geom, kind, width, tail, tip)
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(colour, np.float32))
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     scene.ngeom += 1
+    return geom
 
 
 def _compose(
