@@ -12,6 +12,7 @@ from jaxgrasp.geometry.mesh import MESH_ENDINGS, Mesh
 OBJECTS = ("sphere", "capsule", "box", "cylinder", "ellipsoid", "mesh")
 _MASS = 0.1
 _FRICTION = 0.8
+_HALF_WIDTH = 0.025
 _MESH_VERTICES = 32
 _COUPLED_FINGERS = ("FF", "MF", "RF", "LF")
 
@@ -25,7 +26,7 @@ def shadow_hand(
 
     Args:
         object: One of `OBJECTS`, or a mesh file: see `four_fingers`.
-        size: Half the object's width, m; 0.03 where None.
+        size: As in `four_fingers`.
         coupled_tendons: Whether the two outer joints of each of the four fingers hang on one tendon and are driven by
             one actuator, as in the real hand: tendons `rh_FFJ0` (and MF, RF, LF) with the sum of the joint
             angles J2 + J1, position actuators `rh_A_FFJ0` ... with kp 0.5 N m/rad and at most 1 N m.
@@ -43,20 +44,20 @@ def shadow_hand(
         for finger in _COUPLED_FINGERS:
             _couple(spec, finger)
     _add_light(spec)
-    return _finish(spec, object, 0.03 if size is None else size, position=(0.355, -0.005, 0.08))
+    return _finish(spec, object, size, position=(0.355, -0.005, 0.085))
 
 
 def four_fingers(object: str | Path = "sphere", size: float | None = None) -> mujoco.MjSpec:
     """A ring of four fingers with three joints each and spherical tips of 8 mm, and an object between the tips.
 
-    The joints of finger i are `f{i}_base`, `f{i}_flex1` and `f{i}_flex2`; each has a position actuator of the same name.
+    The joints of finger i are `f{i}_base`, `f{i}_flex1` and `f{i}_flex2`; each has a position actuator of its name.
     The tips' geoms are `f{i}_tip`. The file `four_fingers.xml` has the axes, ranges, gains and limits.
 
     Args:
         object: "sphere", "capsule" (upright), "box" (a cube), "cylinder" (upright), "ellipsoid" or "mesh" (a rounded
             cuboid of 32 vertices), all 0.1 kg; or the path of a mesh file (.stl, .obj, .ply; m), whose
             centre of mass becomes the body's origin and whose convex hull is what touches.
-        size: Half the object's width along x, m; 0.025 where None. A mesh file is scaled to this width.
+        size: Half the object's width along x, m. Where None, 0.025, or what a mesh file says.
 
     Returns:
         The specification, with a free body named "object".
@@ -65,7 +66,7 @@ def four_fingers(object: str | Path = "sphere", size: float | None = None) -> mu
         ValueError: The object is unknown, or the size is not positive.
     """
     spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("four_fingers.xml")))
-    return _finish(spec, object, 0.025 if size is None else size, position=(0.0, 0.0, 0.085))
+    return _finish(spec, object, size, position=(0.0, 0.0, 0.085))
 
 
 def _shadow_hand_file() -> Path:
@@ -101,10 +102,10 @@ def _add_light(spec: mujoco.MjSpec) -> None:
 
 
 def _finish(
-    spec: mujoco.MjSpec, object: str | Path, size: float, position: tuple[float, float, float]
+    spec: mujoco.MjSpec, object: str | Path, size: float | None, position: tuple[float, float, float]
 ) -> mujoco.MjSpec:
     """Adds the object and the settings of the simulation: those with which held objects neither creep nor slip."""
-    if not (np.isfinite(size) and size > 0.0):
+    if size is not None and not (np.isfinite(size) and size > 0.0):
         raise ValueError(f"size: got {size}, wanted a positive number of metres")
     body = spec.worldbody.add_body(name="object", pos=position)
     body.add_freejoint(name="object")
@@ -126,7 +127,8 @@ def _finish(
     return spec
 
 
-def _shape(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, object: str | Path, size: float) -> None:
+def _shape(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, object: str | Path, size: float | None) -> None:
+    half_width = _HALF_WIDTH if size is None else size
     primitives = {
         "sphere": (mujoco.mjtGeom.mjGEOM_SPHERE, (1.0, 0.0, 0.0)),
         "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, (1.0, 0.8, 0.0)),
@@ -136,11 +138,11 @@ def _shape(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, object: str | Path, size: 
     }
     if object in primitives:
         geom.type, proportions = primitives[str(object)]
-        geom.size = size * np.array(proportions)
+        geom.size = half_width * np.array(proportions)
         return
     geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, "object"
     if object == "mesh":
-        spec.add_mesh(name="object", uservert=_rounded_cuboid(size).ravel())
+        spec.add_mesh(name="object", uservert=_rounded_cuboid(half_width).ravel())
     elif Path(object).suffix.lower() in MESH_ENDINGS:
         mesh = Mesh.from_file(object)
         vertices = mesh.vertices - mesh.centroid
@@ -154,7 +156,7 @@ def _shape(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, object: str | Path, size: 
         )
 
 
-def _rounded_cuboid(size: float) -> Float[np.ndarray, "vertices 3"]:
+def _rounded_cuboid(half_width: float) -> Float[np.ndarray, "vertices 3"]:
     """Points with |x/a|^4 + |y/b|^4 + |z/c|^4 = 1 in directions spread evenly, each with its opposite."""
     number = np.arange(_MESH_VERTICES // 2)
     height = (number + 0.5) / len(number)
@@ -162,5 +164,5 @@ def _rounded_cuboid(size: float) -> Float[np.ndarray, "vertices 3"]:
     ring = np.sqrt(1.0 - height**2)
     directions = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=-1)
     directions = np.concatenate([directions, -directions])
-    semi_axes = size * np.array([1.0, 0.9, 1.2])
+    semi_axes = half_width * np.array([1.0, 0.9, 1.2])
     return directions * ((directions / semi_axes) ** 4).sum(-1, keepdims=True) ** -0.25

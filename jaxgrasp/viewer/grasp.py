@@ -77,6 +77,7 @@ def draw_grasp(
 
 
 def round_scale(newtons: float) -> float:
+    """The next round number not below the given positive one."""
     decade = 10.0 ** math.floor(math.log10(newtons))
     return decade * next(
         step for step in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0) if step * decade >= newtons * (1.0 - 1e-9)

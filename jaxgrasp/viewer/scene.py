@@ -59,9 +59,7 @@ def draw_scenes(
 
     model = _for_pictures(model)
     with offscreen(model, _PIXELS, _PIXELS) as render:
-        pictures = [
-            render(_scene(model, *each)) for each in zip(configurations, contact_points, arrows, strict=True)
-        ]
+        pictures = [render(_scene(model, *each)) for each in zip(configurations, contact_points, arrows, strict=True)]
     write_figure(_compose(pictures, titles, newtons_per_mm), path)
 
 
@@ -100,9 +98,7 @@ def _for_pictures(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _scene(
-    model: mujoco.MjModel, configuration: np.ndarray, points: np.ndarray, arrows: np.ndarray
-) -> mujoco.MjvScene:
+def _scene(model: mujoco.MjModel, configuration: np.ndarray, points: np.ndarray, arrows: np.ndarray) -> mujoco.MjvScene:
     data = mujoco.MjData(model)
     data.qpos[:] = configuration
     mujoco.mj_forward(model, data)
@@ -118,9 +114,7 @@ def _scene(
     camera.distance = 1.25 * radius / np.sin(np.radians(0.5 * model.vis.global_.fovy))
     camera.azimuth, camera.elevation = _view(tips - tails)
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + len(drawn) + 100)
-    mujoco.mjv_updateScene(
-        model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene
-    )
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         scene.flags[flag] = 0
     _add_background(scene)
@@ -152,7 +146,7 @@ def _add_arrow(
     geom = _add_geom(scene, kind, colour)
     # The renderer draws an arrow half as long as its geom says.
     mujoco.mjv_connector(geom, kind, width, tail, 2.0 * tip - tail)
-    geom.emission = 0.5
+    geom.emission = 0.15
 
 
 def _add_background(scene: mujoco.MjvScene) -> None:
