@@ -156,6 +156,12 @@ def test_outer_joints_of_the_shadow_hand_are_coupled():
         assert torques == pytest.approx([0.5, 0.5])
 
 
+def test_a_missing_shadow_hand_is_named(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(FileNotFoundError, match="pip install mujoco-mjx"):
+        shadow_hand()
+
+
 @pytest.mark.parametrize(("size", "width"), [(None, 0.06), (0.02, 0.04)])
 def test_a_mesh_file_is_centred_and_scaled(tmp_path, size, width):
     solid = trimesh.creation.box((0.06, 0.03, 0.09))

@@ -43,7 +43,6 @@ def shadow_hand(
     if coupled_tendons:
         for finger in _COUPLED_FINGERS:
             _couple(spec, finger)
-    _add_light(spec)
     return _finish(spec, object, size, position=(0.355, -0.005, 0.085))
 
 
@@ -94,11 +93,6 @@ def _couple(spec: mujoco.MjSpec, finger: str) -> None:
         forcerange=(-1.0, 1.0),
     )
     actuator.set_to_position(kp=0.5)
-
-
-def _add_light(spec: mujoco.MjSpec) -> None:
-    light = spec.worldbody.add_light(pos=(0.3, 0.0, 1.0), dir=(0.0, 0.3, -1.0))
-    light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
 
 
 def _finish(

@@ -70,7 +70,7 @@ def _system() -> Any:
     # Without a display a windowed context opens with no more than a warning, and what is made in it ends the process.
     if sys.platform == "linux" and not display and chosen not in ("egl", "osmesa"):
         if chosen:
-            raise RuntimeError(f"MUJOCO_GL={chosen} wants a display")
+            raise RuntimeError(f"MUJOCO_GL={chosen} opens nothing without a display")
         from mujoco.egl import GLContext
 
         return GLContext
