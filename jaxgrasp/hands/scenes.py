@@ -98,7 +98,7 @@ def _couple(spec: mujoco.MjSpec, finger: str) -> None:
 def _finish(
     spec: mujoco.MjSpec, object: str | Path, size: float | None, position: tuple[float, float, float]
 ) -> mujoco.MjSpec:
-    """Adds the object and the settings of the simulation: those with which held objects neither creep nor slip."""
+    """Adds the object and the settings of the simulation: those with which held objects stay."""
     if size is not None and not (np.isfinite(size) and size > 0.0):
         raise ValueError(f"size: got {size}, wanted a positive number of metres")
     body = spec.worldbody.add_body(name="object", pos=position)
