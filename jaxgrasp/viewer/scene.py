@@ -6,7 +6,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
@@ -72,12 +72,13 @@ def _check(
     for name, array in (("contact_points", points), ("forces", forces)):
         if array.ndim != 3 or array.shape != (count, points.shape[1], 3):
             raise ValueError(f"{name}: got {array.shape}, wanted ({count}, contacts, 3)")
-    if not len(_free_bodies(model)):
-        raise ValueError("model: got no body with a free joint, wanted an object")
+    if not _of_object(model).any():
+        raise ValueError("model: got no body with a free joint and a geom, wanted an object")
 
 
-def _free_bodies(model: mujoco.MjModel) -> np.ndarray:
-    return model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+def _of_object(model: mujoco.MjModel) -> Bool[np.ndarray, " geoms"]:
+    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    return np.isin(model.body_rootid[model.geom_bodyid], free)
 
 
 def _for_pictures(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -88,7 +89,7 @@ def _for_pictures(model: mujoco.MjModel) -> mujoco.MjModel:
     model.vis.headlight.diffuse[:] = 0.45
     model.vis.headlight.specular[:] = 0.0
     model.light_active[:] = 0
-    hand = ~np.isin(model.body_rootid[model.geom_bodyid], _free_bodies(model))
+    hand = ~_of_object(model)
     # A geom with a material has its colour from there; materials may be shared with the object, geoms' colours are not.
     for geom in np.flatnonzero(hand).tolist():
         material = model.geom_matid[geom]
@@ -104,14 +105,14 @@ def _scene(model: mujoco.MjModel, configuration: np.ndarray, points: np.ndarray,
     mujoco.mj_forward(model, data)
     drawn = np.flatnonzero(arrows.any(-1))
     tips, tails = points[drawn], (points - arrows)[drawn]
-    geoms = np.flatnonzero(np.isin(model.geom_bodyid, _free_bodies(model)))
+    geoms = np.flatnonzero(_of_object(model))
     centre = data.geom_xpos[geoms].mean(0)
-    reach = (np.linalg.norm(data.geom_xpos[geoms] - centre, axis=-1) + model.geom_rbound[geoms]).max()
-    radius = max(reach + 0.02, np.linalg.norm(tails - centre, axis=-1).max(initial=0.0))
+    # As wide for short arrows as for the longest: the panels are to be compared.
+    radius = (np.linalg.norm(data.geom_xpos[geoms] - centre, axis=-1) + model.geom_rbound[geoms]).max() + _LONGEST_ARROW
 
     camera = mujoco.MjvCamera()
     camera.lookat[:] = centre
-    camera.distance = 1.25 * radius / np.sin(np.radians(0.5 * model.vis.global_.fovy))
+    camera.distance = 1.05 * radius / np.sin(np.radians(0.5 * model.vis.global_.fovy))
     camera.azimuth, camera.elevation = _view(tips - tails)
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + len(drawn) + 100)
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
