@@ -53,7 +53,7 @@ def draw_grasp(
     reach = float(np.linalg.norm(points, axis=-1).max())
     strength = np.nan_to_num(np.linalg.norm(forces, axis=-1))
     if scale is None:
-        scale = _round_scale(float(strength.max()) / (0.75 * reach)) if strength.any() else np.nan
+        scale = round_scale(float(strength.max()) / (0.75 * reach)) if strength.any() else np.nan
     _frame(axes, points, reach)
     if surface is not None:
         axes.scatter(*(surface * _MILLIMETRES).T, s=5.0, color="0.6", alpha=0.5, linewidths=0, depthshade=False)
@@ -76,7 +76,8 @@ def draw_grasp(
     return scale
 
 
-def _round_scale(newtons: float) -> float:
+def round_scale(newtons: float) -> float:
+    """The next round number not below the given positive one."""
     decade = 10.0 ** math.floor(math.log10(newtons))
     return decade * next(
         step for step in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0) if step * decade >= newtons * (1.0 - 1e-9)

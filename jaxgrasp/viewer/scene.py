@@ -1,0 +1,186 @@
+"""Rendered pictures of hands that hold an object, with the forces of the fingers."""
+
+from collections.abc import Sequence
+from copy import copy
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+
+from jaxgrasp.viewer.grasp import CONTACT_COLOURS, round_scale
+from jaxgrasp.viewer.offscreen import offscreen
+from jaxgrasp.viewer.ranking import write_figure
+
+_PIXELS = 720
+_INCHES = 4.8
+_LONGEST_ARROW = 0.04
+_HAND_ALPHA = 0.35
+
+
+def draw_scenes(
+    path: Path | str,
+    model: mujoco.MjModel,
+    configurations: Float[np.ndarray, "scenes nq"],
+    contact_points: Float[np.ndarray, "scenes contacts 3"],
+    forces: Float[np.ndarray, "scenes contacts 3"],
+    titles: Sequence[str],
+) -> None:
+    """Renders some configurations of a hand and an object, one panel each, and writes the picture.
+
+    The hand is half transparent. Each finger's force on the object is an arrow that ends at the contact, its length
+    proportional to the force, all panels to the same scale. The view is from the side where the arrows can be
+    seen best.
+
+    Args:
+        path: The file; its ending says the format (png, pdf, ...).
+        model: Hand and object, the object a body with a free joint.
+        configurations: The model's `qpos`.
+        contact_points: World frame, m.
+        forces: Of the fingers on the object, world frame, N. Not drawn where it or the point is NaN or it is zero.
+        titles: One a panel.
+
+    Raises:
+        ValueError: The arrays' shapes do not fit the model and each other, or the model has no free body.
+        RuntimeError: No OpenGL context can be had; the message names the remedy.
+        OSError: The file cannot be written.
+    """
+    configurations, contact_points, forces = (
+        np.asarray(array, float) for array in (configurations, contact_points, forces)
+    )
+    _check(model, configurations, contact_points, forces, titles)
+    # NaN in the points counts as no force.
+    forces = np.where(np.isfinite(contact_points).all(-1, keepdims=True), np.nan_to_num(forces), 0.0)
+    strongest = np.linalg.norm(forces, axis=-1).max(initial=0.0)
+    newtons_per_mm = round_scale(float(strongest) / (1e3 * _LONGEST_ARROW)) if strongest > 0.0 else np.nan
+    arrows = forces / (1e3 * newtons_per_mm) if strongest > 0.0 else forces
+
+    model = _for_pictures(model)
+    with offscreen(model, _PIXELS, _PIXELS) as render:
+        pictures = [render(_scene(model, *each)) for each in zip(configurations, contact_points, arrows, strict=True)]
+    write_figure(_compose(pictures, titles, newtons_per_mm), path)
+
+
+def _check(
+    model: mujoco.MjModel, configurations: np.ndarray, points: np.ndarray, forces: np.ndarray, titles: Sequence[str]
+) -> None:
+    count = len(titles)
+    if count == 0 or configurations.shape != (count, model.nq):
+        raise ValueError(f"configurations: got {configurations.shape}, wanted ({count}, {model.nq}), one a title")
+    for name, array in (("contact_points", points), ("forces", forces)):
+        if array.ndim != 3 or array.shape != (count, points.shape[1], 3):
+            raise ValueError(f"{name}: got {array.shape}, wanted ({count}, contacts, 3)")
+    if not _of_object(model).any():
+        raise ValueError("model: got no body with a free joint and a geom, wanted an object")
+
+
+def _of_object(model: mujoco.MjModel) -> Bool[np.ndarray, " geoms"]:
+    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    return np.isin(model.body_rootid[model.geom_bodyid], free)
+
+
+def _for_pictures(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy that is lit from the camera and through whose hand one can see."""
+    model = copy(model)
+    model.vis.global_.offwidth = model.vis.global_.offheight = _PIXELS
+    model.vis.headlight.ambient[:] = 0.45
+    model.vis.headlight.diffuse[:] = 0.45
+    model.vis.headlight.specular[:] = 0.0
+    model.light_active[:] = 0
+    hand = ~_of_object(model)
+    # A geom with a material has its colour from there; materials may be shared with the object, geoms' colours are not.
+    for geom in np.flatnonzero(hand).tolist():
+        material = model.geom_matid[geom]
+        colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+        model.geom_rgba[geom] = [*(0.6 * colour[:3] + 0.4), _HAND_ALPHA * colour[3]]
+    model.geom_matid[hand] = -1
+    return model
+
+
+def _scene(model: mujoco.MjModel, configuration: np.ndarray, points: np.ndarray, arrows: np.ndarray) -> mujoco.MjvScene:
+    data = mujoco.MjData(model)
+    data.qpos[:] = configuration
+    mujoco.mj_forward(model, data)
+    drawn = np.flatnonzero(arrows.any(-1))
+    tips, tails = points[drawn], (points - arrows)[drawn]
+    geoms = np.flatnonzero(_of_object(model))
+    centre = data.geom_xpos[geoms].mean(0)
+    # As wide for short arrows as for the longest: the panels are to be compared.
+    radius = (np.linalg.norm(data.geom_xpos[geoms] - centre, axis=-1) + model.geom_rbound[geoms]).max() + _LONGEST_ARROW
+
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = centre
+    camera.distance = 1.05 * radius / np.sin(np.radians(0.5 * model.vis.global_.fovy))
+    camera.azimuth, camera.elevation = _view(tips - tails)
+    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + len(drawn) + 100)
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        scene.flags[flag] = 0
+    _add_background(scene)
+    for number, tail, tip in zip(drawn.tolist(), tails, tips, strict=True):
+        colour = to_rgba(CONTACT_COLOURS[number % len(CONTACT_COLOURS)])
+        _add_arrow(scene, tail, tip, 0.02 * radius, colour)
+    return scene
+
+
+def _view(pushes: Float[np.ndarray, "arrows 3"]) -> tuple[float, float]:
+    """Azimuth and elevation (degrees) of a view from above in which arrows are seen neither end on nor behind."""
+    azimuths, elevations = np.meshgrid(np.arange(0.0, 360.0, 15.0), np.arange(-55.0, -14.0, 5.0), indexing="ij")
+    a, e = np.radians(azimuths), np.radians(elevations)
+    towards_camera = -np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
+    # Each arrow stands on the object's side that it pushes.
+    outward = -pushes / np.linalg.norm(pushes, axis=-1, keepdims=True)
+    cosine = towards_camera @ outward.T
+    seen = (1.0 - np.clip(-cosine, 0.0, 1.0) ** 2) * np.sqrt(1.0 - np.clip(cosine, -1.0, 1.0) ** 2)
+    # Also the worst one counts: views along one of four arrows would win by the three others.
+    score = seen.mean(-1) + seen.min(-1) if len(pushes) else -((elevations + 35.0) ** 2)
+    best = np.unravel_index(np.argmax(score), score.shape)
+    return float(azimuths[best]), float(elevations[best])
+
+
+def _add_arrow(
+    scene: mujoco.MjvScene, tail: np.ndarray, tip: np.ndarray, width: float, colour: tuple[float, ...]
+) -> None:
+    kind = mujoco.mjtGeom.mjGEOM_ARROW
+    geom = _add_geom(scene, kind, colour)
+    # The renderer draws an arrow half as long as its geom says.
+    mujoco.mjv_connector(geom, kind, width, tail, 2.0 * tip - tail)
+    geom.emission = 0.15
+
+
+def _add_background(scene: mujoco.MjvScene) -> None:
+    """A white wall behind everything: without a sky in the model the background is black."""
+    eye = scene.camera[0]
+    geom = _add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, (1.0, 1.0, 1.0, 1.0))
+    far = 0.9 * eye.frustum_far
+    forward, up = np.array(eye.forward, float), np.array(eye.up, float)
+    geom.pos[:] = np.array(eye.pos) + far * forward
+    geom.mat[:] = np.stack([np.cross(up, forward), up, forward], axis=-1)
+    geom.size[:] = (far, far, 1e-3 * far)
+    geom.emission = 1.0
+
+
+def _add_geom(scene: mujoco.MjvScene, kind: mujoco.mjtGeom, colour: tuple[float, ...]) -> mujoco.MjvGeom:
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(colour, np.float32))
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    scene.ngeom += 1
+    return geom
+
+
+def _compose(
+    pictures: list[UInt8[np.ndarray, "height width 3"]], titles: Sequence[str], newtons_per_mm: float
+) -> Figure:
+    columns = min(len(pictures), 2)
+    rows = -(-len(pictures) // columns)
+    figure = Figure(figsize=(_INCHES * columns, (_INCHES + 0.3) * rows + 0.3), layout="constrained", dpi=150)
+    for axes, picture, title in zip(figure.subplots(rows, columns, squeeze=False).flat, pictures, titles, strict=False):
+        axes.imshow(picture)
+        axes.set_title(title, fontsize=9)
+    for axes in figure.axes:
+        axes.set_axis_off()
+    if np.isfinite(newtons_per_mm):
+        figure.supxlabel(f"arrows: forces of the fingers on the object, 1 mm = {newtons_per_mm:.2g} N", fontsize=8)
+    return figure
