@@ -1,0 +1,6 @@
+"""Hands from MJCF: contacts from joint angles, and what actuators can do with them, by MuJoCo and MJX."""
+
+from jaxgrasp.hands.grasps import HandGrasps
+from jaxgrasp.hands.hand_object import HandObject
+
+__all__ = ["HandGrasps", "HandObject"]

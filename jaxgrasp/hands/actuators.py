@@ -1,0 +1,124 @@
+"""What MuJoCo's actuators can do: transmission, limits of effort, stiffness, and commands for wanted efforts."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+@dataclass(frozen=True)
+class Actuators:
+    """Actuators of a hand whose force is gain * command + bias + slope * length, at rest.
+
+    `numbers` are theirs in the model; every other array has one entry for each of them.
+    """
+
+    numbers: np.ndarray
+    gain: np.ndarray
+    bias: np.ndarray
+    slope: np.ndarray
+    """d force / d length, N per m or N m per rad; minus the stiffness of a position servo."""
+    command: np.ndarray
+    """(actuators, 2), range of commands."""
+    force: np.ndarray
+    """(actuators, 2), range of forces, torque limits of single joints included."""
+    transmission: np.ndarray | None
+    """B (hand's degrees of freedom, actuators); None where it varies with the configuration."""
+
+    def limits(self, length: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Least and largest force at rest, (*batch, actuators), at lengths (*batch, actuators)."""
+        ends = [self.force_of(jnp.asarray(end, length.dtype), length) for end in self.command.T]
+        low, high = jnp.minimum(*ends), jnp.maximum(*ends)
+        least, most = (jnp.asarray(end, length.dtype) for end in self.force.T)
+        return jnp.clip(low, least, most), jnp.clip(high, least, most)
+
+    def force_of(self, command: jax.Array, length: jax.Array) -> jax.Array:
+        """Force at rest before it is limited, for commands and lengths (*batch, actuators)."""
+        gain, bias, slope = self._constants(length)
+        product = jnp.where(gain == 0, 0, gain * command)
+        return product + bias + slope * length
+
+    def command_for(self, force: jax.Array, length: jax.Array) -> jax.Array:
+        """The command that gives a force at rest; NaN for an actuator that no command moves."""
+        gain, bias, slope = self._constants(length)
+        return jnp.where(gain == 0, jnp.nan, (force - bias - slope * length) / jnp.where(gain == 0, 1, gain))
+
+    def _constants(self, like: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        affine = np.array([_affine(model, a) for a in numbers]).reshape(-1, 3)
+
+    unlimited = np.array([-np.inf, np.inf])
+    limited = lambda flags, ranges: np.where(flags[numbers, None], ranges[numbers], unlimited)  # noqa: E731
+    command = limited(model.actuator_ctrllimited, model.actuator_ctrlrange)
+    for row, a in enumerate(numbers):
+        if model.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
+            command[row] = model.actuator_actrange[a] if model.actuator_actlimited[a] else unlimited
+    force = limited(model.actuator_forcelimited, model.actuator_forcerange)
+    return Actuators(
+        numbers=numbers,
+        gain=affine[:, 0],
+        bias=affine[:, 1],
+        slope=affine[:, 2],
+        command=command,
+        force=_joint_limits(model, dofs, numbers, moment, force),
+        transmission=moment[np.ix_(numbers, dofs)].T if constant else None,
+    )
+
+
+def _affine(model: mujoco.MjModel, a: int) -> tuple[float, float, float]:
+    """Gain, bias and slope of the force at rest."""
+    gain_type, bias_type = mujoco.mjtGain(model.actuator_gaintype[a]), mujoco.mjtBias(model.actuator_biastype[a])
+    gain, bias = model.actuator_gainprm[a], model.actuator_biasprm[a]
+    affine_gain = gain_type == mujoco.mjtGain.mjGAIN_AFFINE and gain[1] == 0
+    known = (gain_type == mujoco.mjtGain.mjGAIN_FIXED or affine_gain) and bias_type in (
+        mujoco.mjtBias.mjBIAS_NONE,
+        mujoco.mjtBias.mjBIAS_AFFINE,
+    )
+    if not known:
+        raise ValueError(
+            f"scene: actuator {_name(model, a)} has gain {gain_type.name[7:].lower()} and bias "
+            f"{bias_type.name[7:].lower()}; wanted a force that is affine in its command (motor, position, general)"
+        )
+    offset, slope = (bias[0], bias[1]) if bias_type == mujoco.mjtBias.mjBIAS_AFFINE else (0.0, 0.0)
+    return float(gain[0]), float(offset), float(slope)
+
+
+def _moments(model: mujoco.MjModel) -> np.ndarray:
+    """Moment arms (actuators, degrees of freedom) at the reference configuration."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    moment = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    return moment
+
+
+def _is_fixed(model: mujoco.MjModel, tendon: int) -> bool:
+    first = model.tendon_adr[tendon]
+    return bool(np.all(model.wrap_type[first : first + model.tendon_num[tendon]] == mujoco.mjtWrap.mjWRAP_JOINT))
+
+
+def _joint_limits(
+    model: mujoco.MjModel, dofs: np.ndarray, numbers: np.ndarray, moment: np.ndarray, force: np.ndarray
+) -> np.ndarray:
+    """Force ranges within the limits of the joints' own (`actuatorfrcrange`)."""
+    force = force.copy()
+    for joint in np.flatnonzero(model.jnt_actfrclimited):
+        dof = model.jnt_dofadr[joint]
+        if dof not in dofs:
+            continue
+        rows = np.flatnonzero(moment[numbers, dof])
+        if len(rows) != 1 or np.count_nonzero(moment[numbers[rows[0]]]) != 1:
+            raise ValueError(
+                f"scene: joint {model.joint(joint).name!r} limits the sum of its actuators' forces; wanted limits of "
+                "the actuators themselves (forcerange) where these act on several joints or together"
+            )
+        ends = np.sort(model.jnt_actfrcrange[joint] / moment[numbers[rows[0]], dof])
+        force[rows[0]] = np.clip(force[rows[0]], *ends)
+    return force
+
+
+def _name(model: mujoco.MjModel, actuator: int) -> str:
+    return repr(model.actuator(actuator).name) if model.actuator(actuator).name else f"number {actuator}"

@@ -1,0 +1,95 @@
+"""Joints that an equality constraint makes follow others: the velocities that remain free."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Couplings:
+    """Which of a hand's degrees of freedom follow which.
+
+    follower, leader: (couplings,), places among the hand's degrees of freedom; the leader is -1 where there is none.
+    coefficients: (couplings, 4), the derivative's polynomial in the leader's displacement, constant first.
+    reference: (couplings,), the leader's position from which that counts.
+    free: places of the degrees of freedom that follow none.
+    """
+
+    follower: np.ndarray
+    leader: np.ndarray
+    coefficients: np.ndarray
+    reference: np.ndarray
+    free: np.ndarray
+
+    @property
+    def linear(self) -> bool:
+        """Whether all slopes are constant."""
+        return not self.coefficients[:, 1:].any()
+
+    def velocities(self, joints: jax.Array) -> jax.Array:
+        """T (*batch, dofs, free): all joint velocities from the free ones, at joint positions (*batch, dofs)."""
+        count = joints.shape[-1]
+        rows = list(jnp.moveaxis(jnp.broadcast_to(jnp.eye(count, dtype=joints.dtype), (*joints.shape, count)), -2, 0))
+        # Couplings may hang on each other in any order.
+        for _ in range(len(self.follower)):
+            for follower, leader, coefficients, reference in zip(
+                self.follower, self.leader, self.coefficients, self.reference, strict=True
+            ):
+                if leader < 0:
+                    rows[follower] = jnp.zeros_like(rows[follower])
+                    continue
+                at = joints[..., leader] - float(reference)
+                slope = sum(float(c) * at**power for power, c in enumerate(coefficients))
+                rows[follower] = slope[..., None] * rows[leader]
+        return jnp.stack(rows, -2)[..., self.free]
+
+
+def read_couplings(model: mujoco.MjModel, dofs: np.ndarray) -> Couplings:
+    """Reads the couplings among a hand's joints.
+
+    Args:
+        model: The scene.
+        dofs: Degrees of freedom of the hand's joints.
+
+    Raises:
+        ValueError: An equality constraint, which is named, closes a loop through the hand or acts on tendons.
+    """
+    place = {int(dof): i for i, dof in enumerate(dofs)}
+    found = []
+    for e in np.flatnonzero(model.eq_active0):
+        kind = mujoco.mjtEq(model.eq_type[e])
+        if kind == mujoco.mjtEq.mjEQ_JOINT:
+            follower, leader = (int(j) for j in (model.eq_obj1id[e], model.eq_obj2id[e]))
+            at = place.get(int(model.jnt_dofadr[follower]))
+            if at is None:
+                continue
+            slopes = model.eq_data[e, 1:5] * np.arange(1, 5)
+            if leader < 0:
+                found.append((at, -1, np.zeros(4), 0.0))
+            else:
+                reference = model.qpos0[model.jnt_qposadr[leader]]
+                found.append((at, place[int(model.jnt_dofadr[leader])], slopes, reference))
+        elif kind not in (mujoco.mjtEq.mjEQ_WELD,) or not _holds_a_base(model, e):
+            raise ValueError(
+                f"scene: equality constraint {model.equality(e).name or e!r} is of kind {kind.name[5:].lower()}; "
+                "wanted couplings of joints alone"
+            )
+    follower = np.array([f[0] for f in found], int)
+    return Couplings(
+        follower=follower,
+        leader=np.array([f[1] for f in found], int),
+        coefficients=np.array([f[2] for f in found]).reshape(-1, 4),
+        reference=np.array([f[3] for f in found]),
+        free=np.setdiff1d(np.arange(len(dofs)), follower),
+    )
+
+
+def _holds_a_base(model: mujoco.MjModel, equality: int) -> bool:
+    """Whether a weld only holds a free body, the base of a hand for example, in its place."""
+    if model.eq_objtype[equality] != mujoco.mjtObj.mjOBJ_BODY:
+        return False
+    free = set(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
+    return bool(free & {int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])})

@@ -1,0 +1,44 @@
+"""What a hand in a configuration does to an object: contacts, and which forces its actuators can give them."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxgrasp.contact import Actuation, Contacts
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class HandGrasps:
+    """Grasps of a `HandObject` in a batch of configurations."""
+
+    contacts: Contacts
+    """In the object's frame about its centre of mass, the nearest first; active where they touch."""
+    distances: Float[Array, "*batch contacts"]
+    """Of the surfaces at each contact, m, negative where they penetrate; inf in slots without a point."""
+    links: Int[Array, "*batch contacts"]
+    """The body of the hand that each contact is on, its number in the model."""
+    touching: Int[Array, "*batch"]
+    """How many contacts touch, also those beyond `max_contacts`."""
+    penetration: Float[Array, "*batch"]
+    """The deepest penetration of hand and object, m, at least 0."""
+    required_wrench: Float[Array, "*batch 6"]
+    """The object's weight, to be borne, N and N m, object frame; NaN where the configuration is not admissible."""
+    actuation: Actuation
+    """What the actuators can do; joints are the hand's, without those that a coupling makes follow others."""
+    actuator_lengths: Float[Array, "*batch actuators"]
+    """rad or m, from which position servos pull."""
+    joint_stiffness: Float[Array, "*batch joints joints"]
+    """K, N m/rad or N/m: position servos by their gains, and springs."""
+    object_position: Float[Array, "*batch 3"]
+    """The object's centre of mass, m, world frame."""
+    object_rotation: Float[Array, "*batch 3 3"]
+    """The object's frame: columns are its axes in the world frame."""
+
+    def in_world_frame(self, forces: Float[Array, "*batch contacts 3"]) -> tuple[Array, Array]:
+        """Contact points, m, and forces (*batch, n_c, 3), N, given in contact frames, both in the world frame."""
+        turned = jnp.einsum("...ij,...cjk,...ck->...ci", self.object_rotation, self.contacts.frames, forces)
+        points = jnp.einsum("...ij,...cj->...ci", self.object_rotation, self.contacts.positions)
+        return points + self.object_position[..., None, :], turned

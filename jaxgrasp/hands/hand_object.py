@@ -1,0 +1,383 @@
+"""A hand and an object from MJCF: from joint angles to contacts and to what the actuators can do."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from os import PathLike
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxgrasp.arrays import as_float, safe_divide, safe_norm
+from jaxgrasp.compiling import compiled
+from jaxgrasp.contact import Actuation, Contacts, required_wrench
+from jaxgrasp.hands.actuators import Actuators, read_actuators
+from jaxgrasp.hands.couplings import Couplings, read_couplings
+from jaxgrasp.hands.grasps import HandGrasps
+from jaxgrasp.hands.kinematics import Kinematics, Pose
+from jaxgrasp.hands.touching import PairTable, Points, pair_table, touching_points
+
+# Quaternions are normalised; farther from 1 than this they are taken for a mistake.
+_QUATERNION_TOLERANCE = 1e-3
+_MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandObject:
+    """A scene with a hand and an object, made with `from_mjcf`. Its methods work under jit, vmap and grad."""
+
+    model: mujoco.MjModel
+    """The scene."""
+    object_body: int
+    """The object's body."""
+    joints: np.ndarray
+    """The hand's joints, hinges and slides; free joints count as held where they are."""
+    dofs: np.ndarray
+    """Their degrees of freedom."""
+    contact_distance: float
+    max_contacts: int
+    max_force: float
+    friction: float | None
+    merge: float | None
+    _kinematics: Kinematics
+    _table: PairTable
+    _actuators: Actuators
+    _couplings: Couplings
+
+    @classmethod
+    def from_mjcf(
+        cls,
+        scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel,
+        object_body: str,
+        *,
+        hand_body: str | None = None,
+        contact_distance: float = 1e-3,
+        max_contacts: int = 8,
+        max_force: float = 10.0,
+        friction: float | None = None,
+        merge: float | None = None,
+    ) -> "HandObject":
+        """A hand and an object from a scene.
+
+        Args:
+            scene: An MJCF file, a specification or a model.
+            object_body: Name of the object's body, free or fixed; all geoms of it and of bodies fixed to it count.
+            hand_body: Name of the hand's first body, with all bodies below it; None is every other body but the world.
+            contact_distance: Geoms no farther apart than this touch, m.
+            max_contacts: How many contacts a grasp keeps, the nearest ones.
+            max_force: Largest normal force of every contact, N.
+            friction: Coulomb's coefficient for all contacts; None is what MuJoCo makes of the geoms'.
+            merge: Where several points on one link of the hand touch, the points no farther than this from the nearest
+                one, m, become one contact at their mean, and the link's other points count no more; None keeps all.
+
+        Raises:
+            ValueError: The scene cannot be read, there is no such body, the object or a joint of the hand is of a kind
+                that is not covered, or a pair of geoms can touch whose distance is not known.
+        """
+        for name, value in (("contact_distance", contact_distance), ("max_force", max_force)):
+            if not np.isfinite(value) or value < 0 or (name == "max_force" and value == 0):
+                raise ValueError(f"{name}: got {value}, wanted a finite positive number")
+        if max_contacts < 1:
+            raise ValueError(f"max_contacts: got {max_contacts}, wanted at least 1")
+        model = _read(scene)
+        body = _body(model, "object_body", object_body)
+        of_object = _below(model, body)
+        if np.any(model.body_jntnum[of_object[1:]]):
+            raise ValueError(f"object_body: got {object_body!r}, with joints inside; wanted a rigid object")
+        hand = np.arange(1, model.nbody) if hand_body is None else _below(model, _body(model, "hand_body", hand_body))
+        hand = np.setdiff1d(hand, of_object)
+        joints = np.flatnonzero(np.isin(model.jnt_bodyid, hand))
+        for joint in joints:
+            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
+                raise ValueError(f"scene: joint {model.joint(joint).name!r} is a ball; wanted hinges and slides")
+        joints = joints[np.isin(model.jnt_type[joints], _MOVING)]
+        dofs = model.jnt_dofadr[joints]
+        return cls(
+            model=model,
+            object_body=body,
+            joints=joints,
+            dofs=dofs,
+            contact_distance=float(contact_distance),
+            max_contacts=int(max_contacts),
+            max_force=float(max_force),
+            friction=friction,
+            merge=merge,
+            _kinematics=Kinematics(model),
+            _table=pair_table(model, hand, of_object),
+            _actuators=read_actuators(model, dofs),
+            _couplings=read_couplings(model, dofs),
+        )
+
+    @property
+    def nq(self) -> int:
+        """Length of a configuration."""
+        return self.model.nq
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints of `HandGrasps.actuation`, in order."""
+        return tuple(self.model.joint(self.joints[i]).name for i in self._couplings.free)
+
+    @property
+    def actuator_names(self) -> tuple[str, ...]:
+        """The actuators of `HandGrasps.actuation`, in order."""
+        return tuple(self.model.actuator(a).name for a in self._actuators.numbers)
+
+    def grasps(self, qpos: ArrayLike) -> HandGrasps:
+        """What the hand does in a batch of configurations.
+
+        Args:
+            qpos: (*batch, nq), as MuJoCo lays configurations out: rad, m, and unit quaternions (w, x, y, z).
+
+        Returns:
+            The grasps. A configuration that is not finite, or has a quaternion whose norm is not 1 to 0.001, becomes a
+            grasp that the programs answer with `Status.INVALID_INPUT`.
+
+        Raises:
+            ValueError: qpos has another length.
+
+        Derivatives:
+            Of everything but `links` and counts with respect to qpos; kinks where the nearest features of two geoms
+            change.
+        """
+        qpos = as_float("qpos", qpos, (self.nq,))
+        batch = qpos.shape[:-1]
+        flat = self._compiled(qpos.reshape(-1, self.nq).astype(jnp.result_type(float)))
+        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), flat)
+
+    def controls(self, grasps: HandGrasps, efforts: ArrayLike) -> Float[Array, "*batch actuators"]:
+        """Commands with which the actuators exert the efforts while the hand rests in the grasps' configurations.
+
+        A position servo is sent beyond where it is, to squeeze. The limits of commands are not applied here: they are
+        part of the limits of `HandGrasps.actuation`.
+
+        Args:
+            grasps: Of the configurations.
+            efforts: (*batch, n_u), `Solution.actuator_efforts` for example, N or N m.
+
+        Returns:
+            The part of MuJoCo's `ctrl` that belongs to `actuator_names`; NaN for actuators without gain.
+        """
+        efforts = as_float("efforts", efforts, (len(self._actuators.numbers),))
+        return self._actuators.command_for(efforts, grasps.actuator_lengths)
+
+    def compliance(self, grasps: HandGrasps, tip_stiffness: ArrayLike) -> Float[Array, "*batch rows rows"]:
+        """The compliance Q = J K^+ J' + K_tip^-1 of the contacts, for (14), from joint and fingertip stiffness.
+
+        Directions that no stiffness reaches are left to N'J'f = 0, so this belongs with `grasps.actuation`.
+
+        Args:
+            grasps: Of the configurations.
+            tip_stiffness: Of every fingertip, N/m: scalar, or (*batch, n_c).
+
+        Returns:
+            (*batch, 3 n_c, 3 n_c), m/N, contact frames.
+
+        Raises:
+            ValueError: An actuator without stiffness, a motor for example.
+        """
+        soft = self._actuators.slope >= 0
+        if soft.any():
+            names = ", ".join(repr(n) for n, s in zip(self.actuator_names, soft, strict=True) if s)
+            raise ValueError(f"compliance: actuators {names} have no stiffness; wanted position servos")
+        stiffness = as_float("tip_stiffness", tip_stiffness, ())
+        jacobian = grasps.actuation.jacobian
+        flexible = jnp.linalg.pinv(grasps.joint_stiffness, rtol=1e-9)
+        tall = jacobian.reshape(*jacobian.shape[:-3], -1, jacobian.shape[-1])
+        tips = jnp.broadcast_to(1 / stiffness, jacobian.shape[:-2]) if stiffness.ndim == 0 else 1 / stiffness
+        tips = jnp.broadcast_to(jnp.repeat(tips, 3, -1), tall.shape[:-1])
+        return tall @ flexible @ jnp.swapaxes(tall, -1, -2) + tips[..., None] * jnp.eye(
+            tall.shape[-2], dtype=tall.dtype
+        )
+
+    @cached_property
+    def _compiled(self):
+        return compiled(self._grasps)
+
+    def _grasps(self, qpos: jax.Array) -> HandGrasps:
+        """For (n, nq)."""
+        admissible = self._admissible(qpos)
+        safe = jnp.where(admissible[:, None], qpos, jnp.asarray(self.model.qpos0, qpos.dtype))
+        pose = self._kinematics.poses(safe)
+        rotation = pose.body_rotations[:, self.object_body]
+        centre = self._mass_centre(pose)
+        points, friction, links = self._points(pose)
+        touching = points.distance <= self.contact_distance
+        distances, chosen = lax.top_k(-points.distance, min(self.max_contacts, points.distance.shape[-1]))
+        pick = lambda x: jnp.take_along_axis(x, chosen[..., None], 1)  # noqa: E731
+        world, normal, distances = pick(points.position), pick(points.normal), -distances
+        links = jnp.asarray(links)[chosen]
+        position = jnp.einsum("nji,ncj->nci", rotation, world - centre[:, None])
+        # A grasp that is not admissible has one contact that is not, either.
+        position = jnp.where(admissible[:, None, None], position, jnp.nan)
+        contacts = Contacts.from_normals(
+            position,
+            jnp.einsum("nji,ncj->nci", rotation, normal),
+            friction=jnp.asarray(friction, qpos.dtype)[chosen] if self.friction is None else self.friction,
+            max_force=self.max_force,
+            active=(distances <= self.contact_distance) | ~admissible[:, None],
+        )
+        mass = float(self.model.body_mass[_below(self.model, self.object_body)].sum())
+        gravity = jnp.einsum("nji,j->ni", rotation, jnp.asarray(self.model.opt.gravity, qpos.dtype))
+        weight = required_wrench(mass, gravity=gravity)
+        lengths, actuation, stiffness = self._transmission(safe, pose, world, rotation, contacts.frames, links)
+        return HandGrasps(
+            contacts=contacts,
+            distances=distances,
+            links=links,
+            touching=touching.sum(-1),
+            penetration=jnp.maximum(0, -points.distance.min(-1)),
+            required_wrench=jnp.where(admissible[:, None], weight, jnp.nan),
+            actuation=actuation,
+            actuator_lengths=lengths,
+            joint_stiffness=stiffness,
+            object_position=centre,
+            object_rotation=rotation,
+        )
+
+    def _admissible(self, qpos: jax.Array) -> jax.Array:
+        fine = jnp.isfinite(qpos).all(-1)
+        for joint, kind in enumerate(self.model.jnt_type):
+            if kind in _MOVING:
+                continue
+            start = self.model.jnt_qposadr[joint] + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 0)
+            norm = safe_norm(qpos[:, start : start + 4])
+            fine &= jnp.abs(norm - 1) <= _QUATERNION_TOLERANCE
+        return fine
+
+    def _mass_centre(self, pose: Pose) -> jax.Array:
+        bodies = _below(self.model, self.object_body)
+        masses = self.model.body_mass[bodies]
+        if masses.sum() == 0:
+            return pose.mass_centres[:, self.object_body]
+        return jnp.einsum(
+            "b,nbi->ni", jnp.asarray(masses / masses.sum(), pose.anchors.dtype), pose.mass_centres[:, bodies]
+        )
+
+    def _points(self, pose: Pose) -> tuple[Points, np.ndarray, np.ndarray]:
+        """Points (n, slots, ...), and friction and link of every slot."""
+        table = self._table
+        lanes_last = lambda x: jnp.moveaxis(x, 0, -1)  # noqa: E731
+        found = touching_points(table, lanes_last(pose.geom_positions), lanes_last(pose.geom_rotations))
+        points = Points(*[jnp.moveaxis(x, -1, 0) for x in found])
+        if self.merge is None:
+            return points, table.friction, table.link
+        merged, friction, links = [], [], np.unique(table.link)
+        for link in links:
+            rows = np.flatnonzero(table.link == link)
+            merged.append(self._merged(Points(*[x[:, rows] for x in points])))
+            friction.append(table.friction[rows].min())
+        stacked = [jnp.stack(parts, 1) for parts in zip(*merged, strict=True)]
+        return Points(*stacked), np.array(friction), links
+
+    def _merged(self, points: Points) -> Points:
+        """One point for those of a link (n, slots, ...)."""
+        nearest = points.distance.argmin(-1)[:, None]
+        best = [jnp.take_along_axis(x, nearest.reshape(-1, *[1] * (x.ndim - 1)), 1) for x in points]
+        near = safe_norm(points.position - best[0]) <= self.merge
+        share = (near & (points.distance <= self.contact_distance)).astype(points.position.dtype)
+        # Where nothing touches, the nearest point stands for itself.
+        own = jnp.arange(share.shape[-1]) == nearest
+        share = jnp.where(share.any(-1, keepdims=True), share, own.astype(share.dtype))
+        # Slots that hold no point may hold anything.
+        mean = lambda x: jnp.sum(jnp.where(share[..., None] > 0, x, 0), 1) / share.sum(-1, keepdims=True)  # noqa: E731
+        normal = mean(points.normal)
+        return Points(mean(points.position), safe_divide(normal, safe_norm(normal)[..., None]), best[2][:, 0])
+
+    def _transmission(
+        self,
+        qpos: jax.Array,
+        pose: Pose,
+        world: jax.Array,
+        rotation: jax.Array,
+        frames: jax.Array,
+        links: jax.Array,
+    ) -> tuple[jax.Array, Actuation, jax.Array]:
+        """Actuator lengths, actuation and joint stiffness; `world` (n, n_c, 3) are the contacts."""
+        model, dtype = self.model, qpos.dtype
+        axes, anchors = pose.axes[:, None, self.joints], pose.anchors[:, None, self.joints]
+        hinge = jnp.asarray(model.jnt_type[self.joints] == mujoco.mjtJoint.mjJNT_HINGE)
+        turning = jnp.cross(axes, world[:, :, None] - anchors)
+        moves = jnp.asarray(_moved_bodies(model, self.joints))[links]
+        velocity = jnp.where(moves[..., None], jnp.where(hinge[:, None], turning, axes), 0)
+        turned = jnp.einsum("nji,ncvj->ncvi", rotation, velocity)
+        # Contacts that are not admissible have no frames.
+        jacobian = jnp.einsum("ncia,ncvi->ncav", jnp.where(jnp.isnan(frames), 0, frames), turned)
+        joints = qpos[:, model.jnt_qposadr[self.joints]]
+        lengths, transmission = self._lengths(qpos, joints)
+        springs = jnp.diag(jnp.asarray(model.jnt_stiffness[self.joints], dtype))
+        if len(self._couplings.follower):
+            free = self._couplings.velocities(joints)
+            jacobian = jacobian @ free[:, None]
+            transmission = jnp.swapaxes(free, -1, -2) @ transmission
+            springs = jnp.swapaxes(free, -1, -2) @ springs @ free
+            if self._couplings.linear and self._actuators.transmission is not None:
+                transmission = np.asarray(
+                    self._couplings.velocities(jnp.zeros(len(self.dofs))).T @ self._actuators.transmission
+                )
+        least, most = self._actuators.limits(lengths)
+        actuation = Actuation.from_jacobian(jacobian, transmission, least, most)
+        servo = jnp.asarray(np.maximum(-self._actuators.slope, 0), dtype)
+        through = jnp.asarray(transmission, dtype)
+        stiffness = (through * servo) @ jnp.swapaxes(through, -1, -2) + springs
+        spread = lambda x, event: jnp.broadcast_to(x, (len(qpos), *x.shape[x.ndim - event :]))  # noqa: E731
+        whole = {name: spread(getattr(actuation, name), 2) for name in ("transmission", "inverse")}
+        if actuation.unreached is not None:
+            whole["unreached"] = spread(actuation.unreached, 2)
+        return lengths, replace(actuation, **whole), spread(stiffness, 2)
+
+    def _lengths(self, qpos: jax.Array, joints: jax.Array) -> tuple[jax.Array, jax.Array | np.ndarray]:
+        """Lengths (n, actuators) and B, (joints, actuators) where it is the same everywhere."""
+        numbers, constant = self._actuators.numbers, self._actuators.transmission
+        if constant is not None:
+            data = mujoco.MjData(self.model)
+            mujoco.mj_forward(self.model, data)
+            start = jnp.asarray(data.actuator_length[numbers], qpos.dtype)
+            rest = jnp.asarray(self.model.qpos0[self.model.jnt_qposadr[self.joints]], qpos.dtype)
+            return start + (joints - rest) @ jnp.asarray(constant, qpos.dtype), constant
+
+        def lengths(change: jax.Array) -> jax.Array:
+            moved = qpos.at[:, self.model.jnt_qposadr[self.joints]].add(change)
+            return self._kinematics.actuator_lengths(moved)[:, numbers]
+
+        zero = jnp.zeros(len(self.dofs), qpos.dtype)
+        return lengths(zero), jnp.moveaxis(jax.jacfwd(lengths)(zero), -1, -2)
+
+
+def _read(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
+    if isinstance(scene, mujoco.MjModel):
+        return scene
+    try:
+        return scene.compile() if isinstance(scene, mujoco.MjSpec) else mujoco.MjModel.from_xml_path(str(scene))
+    except ValueError as error:
+        name = "the specification" if isinstance(scene, mujoco.MjSpec) else scene
+        raise ValueError(f"scene: {name} cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _body(model: mujoco.MjModel, argument: str, name: str) -> int:
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    if body <= 0:
+        names = ", ".join(model.body(b).name for b in range(1, model.nbody) if model.body(b).name)
+        raise ValueError(f"{argument}: got {name!r}, wanted one of the scene's bodies: {names}")
+    return body
+
+
+def _below(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """A body and all bodies below it, itself first."""
+    inside = {body}
+    for other in range(body + 1, model.nbody):
+        if int(model.body_parentid[other]) in inside:
+            inside.add(other)
+    return np.array(sorted(inside))
+
+
+def _moved_bodies(model: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
+    """(bodies, joints), bool: which joints move a body."""
+    moved = np.zeros((model.nbody, len(joints)), bool)
+    for body in range(1, model.nbody):
+        moved[body] = moved[model.body_parentid[body]] | (model.jnt_bodyid[joints] == body)
+    return moved

@@ -1,0 +1,186 @@
+"""Which geoms of a hand can touch which of an object, and where they do: one contact slot for every possible point."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxgrasp.geometry.pairs import Geom, Hull, slots, touch
+
+KIND = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Pairs of geoms that one function of the table of pairs answers, all at once."""
+
+    kinds: tuple[str, str]
+    hand: np.ndarray
+    """(pairs,), geoms of the hand."""
+    object: np.ndarray
+    """(pairs,), geoms of the object."""
+    hulls: tuple[Hull | None, Hull | None]
+
+
+class Points(NamedTuple):
+    """Where geoms touch or come near, in the world frame; slots lead, the batch trails."""
+
+    position: jax.Array
+    """(slots, 3, *lanes), midway between the surfaces, m."""
+    normal: jax.Array
+    """(slots, 3, *lanes), outward from the object, unit."""
+    distance: jax.Array
+    """(slots, *lanes), m, negative where they penetrate; inf in slots without a point."""
+
+
+@dataclass(frozen=True)
+class PairTable:
+    """The pairs of a scene in groups, and what is known of every slot beforehand."""
+
+    groups: tuple[Group, ...]
+    sizes: np.ndarray
+    """(geoms, 3), MuJoCo's sizes."""
+    link: np.ndarray
+    """(slots,), body of the hand."""
+    friction: np.ndarray
+    """(slots,), sliding friction by MuJoCo's rule."""
+
+
+def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> PairTable:
+    """Finds the pairs of geoms that MuJoCo lets collide.
+
+    Args:
+        model: The scene.
+        hand: Bodies of the hand.
+        object: Bodies of the object.
+
+    Raises:
+        ValueError: A pair of geoms that can touch has no function, or nothing of the hand can touch the object.
+    """
+    found: dict[tuple, list[tuple[int, int]]] = {}
+    friction: dict[tuple[int, int], float] = _pairs(model, hand, object)
+    for pair in friction:
+        kinds = _kinds(model, *pair)
+        meshes = tuple(int(model.geom_dataid[g]) if k == "mesh" else -1 for g, k in zip(pair, kinds, strict=True))
+        found.setdefault((kinds, meshes), []).append(pair)
+    if not found:
+        raise ValueError(
+            "scene: no geom of the hand can touch a geom of the object; "
+            "wanted contype and conaffinity that let some of them collide"
+        )
+    groups, link, mu = [], [], []
+    for (kinds, meshes), pairs in found.items():
+        geoms = np.array(pairs)
+        groups.append(Group(kinds, geoms[:, 0], geoms[:, 1], tuple(None if m < 0 else _hull(model, m) for m in meshes)))
+        count = slots(*kinds)
+        link.append(np.tile(model.geom_bodyid[geoms[:, 0]], count))
+        mu.append(np.tile([friction[pair] for pair in pairs], count))
+    return PairTable(tuple(groups), model.geom_size, np.concatenate(link), np.concatenate(mu))
+
+
+def touching_points(table: PairTable, positions: jax.Array, rotations: jax.Array) -> Points:
+    """Points of all slots.
+
+    Args:
+        table: The pairs.
+        positions: (geoms, 3, *lanes), of the geoms' frames, m, world frame.
+        rotations: (geoms, 3, 3, *lanes), columns are their axes.
+    """
+    found = []
+    for group in table.groups:
+        sides = [
+            _geoms(table, positions, rotations, geoms, hull)
+            for geoms, hull in zip((group.hand, group.object), group.hulls, strict=True)
+        ]
+        found.append(touch(*group.kinds, *sides))
+
+    def lay_out(*parts: jax.Array) -> jax.Array:
+        """(k, [3,] pairs, *lanes) each -> (slots, [3,] *lanes)."""
+        event = parts[0].ndim - len(positions.shape[2:]) - 2
+        flat = [jnp.moveaxis(p, 1 + event, 1) for p in parts]
+        return jnp.concatenate([p.reshape(-1, *p.shape[2:]) for p in flat])
+
+    position, normal, distance = (lay_out(*parts) for parts in zip(*found, strict=True))
+    # MuJoCo's normal, and that of the pairs, points from the hand to the object: ours is the object's outward normal.
+    return Points(position, -normal, distance)
+
+
+def _geoms(table: PairTable, positions: jax.Array, rotations: jax.Array, geoms: np.ndarray, hull: Hull | None) -> Geom:
+    lanes = positions.shape[2:]
+    size = jnp.asarray(table.sizes[geoms].T, positions.dtype).reshape(3, len(geoms), *[1] * len(lanes))
+    return Geom(
+        position=jnp.moveaxis(positions[geoms], 0, 1),
+        rotation=jnp.moveaxis(rotations[geoms], 0, 2),
+        size=jnp.broadcast_to(size, (3, len(geoms), *lanes)),
+        hull=hull,
+    )
+
+
+def _kinds(model: mujoco.MjModel, hand: int, object: int) -> tuple[str, str]:
+    kinds = tuple(KIND.get(mujoco.mjtGeom(model.geom_type[g])) for g in (hand, object))
+    try:
+        slots(*kinds)
+    except (ValueError, KeyError):
+        names = [f"{_name(model, g)} ({mujoco.mjtGeom(model.geom_type[g]).name[7:].lower()})" for g in (hand, object)]
+        raise ValueError(
+            f"scene: geoms {names[0]} and {names[1]} can touch, but no distance is known between their kinds; "
+            f"wanted {', '.join(KIND.values())}, or contype and conaffinity that keep them apart"
+        ) from None
+    return kinds
+
+
+def _name(model: mujoco.MjModel, geom: int) -> str:
+    return repr(model.geom(geom).name) if model.geom(geom).name else f"number {geom}"
+
+
+def _hull(model: mujoco.MjModel, mesh: int) -> Hull:
+    """The convex hull that MuJoCo keeps of a mesh."""
+    start = model.mesh_graphadr[mesh]
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    vertices = np.asarray(model.mesh_vert[first : first + count], float)
+    if start < 0:
+        raise ValueError(f"scene: mesh {model.mesh(mesh).name!r} has no convex hull; wanted one that can collide")
+    graph = model.mesh_graph[start:]
+    num_vertices, num_faces = graph[:2]
+    kept = graph[2 + num_vertices : 2 + 2 * num_vertices]
+    edges = 2 + 3 * num_vertices + 3 * num_faces
+    faces = graph[edges : edges + 3 * num_faces].reshape(-1, 3)
+    number = {int(v): i for i, v in enumerate(kept)}
+    return Hull.from_faces(vertices[kept], np.vectorize(number.__getitem__)(faces))
+
+
+def _pairs(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> dict[tuple[int, int], float]:
+    """Pairs (geom of the hand, geom of the object) that MuJoCo's filters let pass, and their sliding friction."""
+    of_hand = np.flatnonzero(np.isin(model.geom_bodyid, hand))
+    of_object = np.flatnonzero(np.isin(model.geom_bodyid, object))
+    friction = {}
+    excluded = {tuple(sorted((s >> 16, s & 0xFFFF))) for s in model.exclude_signature.tolist()}
+    for g in of_hand.tolist():
+        for o in of_object.tolist():
+            bodies = tuple(sorted((int(model.geom_bodyid[g]), int(model.geom_bodyid[o]))))
+            meet = model.geom_contype[g] & model.geom_conaffinity[o] | model.geom_contype[o] & model.geom_conaffinity[g]
+            if meet and bodies not in excluded:
+                friction[g, o] = _combined_friction(model, g, o)
+    # Pairs that are spelt out count whatever the masks say.
+    for one, other, values in zip(model.pair_geom1, model.pair_geom2, model.pair_friction, strict=True):
+        for pair in ((int(one), int(other)), (int(other), int(one))):
+            if pair[0] in of_hand and pair[1] in of_object:
+                friction[pair] = float(values[0])
+    return friction
+
+
+def _combined_friction(model: mujoco.MjModel, a: int, b: int) -> float:
+    """That of the geom with the higher priority, the larger one where these are equal."""
+    if model.geom_priority[a] != model.geom_priority[b]:
+        return float(model.geom_friction[a if model.geom_priority[a] > model.geom_priority[b] else b, 0])
+    return float(max(model.geom_friction[a, 0], model.geom_friction[b, 0]))
