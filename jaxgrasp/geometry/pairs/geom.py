@@ -2,10 +2,11 @@
 
 from typing import NamedTuple
 
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from jaxgrasp.geometry.pairs.vectors import Rotation, Vector
 
 KINDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 
@@ -25,7 +26,7 @@ class Hull(NamedTuple):
             faces: (faces, 3), indices of the faces' corners; vertices that no face has are left out.
 
         Raises:
-            ValueError: other shapes, no faces, not finite, or indices out of range.
+            ValueError: other shapes, no solid, not finite, or indices out of range.
         """
         vertices, faces = np.asarray(vertices, float), np.asarray(faces)
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
@@ -62,6 +63,33 @@ class Touch(NamedTuple):
     """(k, *lanes), of the surfaces along the normal, m: negative inside each other, +inf in slots that hold no point."""
 
 
-def single(position: Array, normal: Array, distance: Array) -> Touch:
-    """A touch of one slot."""
-    return Touch(position[None], normal[None], distance[None])
+class Body(NamedTuple):
+    """A `Geom` by components."""
+
+    position: Vector
+    rotation: Rotation
+    size: Vector
+    hull: Hull | None
+
+    @classmethod
+    def of(cls, geom: Geom) -> "Body":
+        """The geom's arrays, taken apart."""
+        x, y, z = (Vector.unstacked(geom.rotation[:, i]) for i in range(3))
+        return cls(Vector.unstacked(geom.position), (x, y, z), Vector.unstacked(geom.size), geom.hull)
+
+
+class Point(NamedTuple):
+    """One slot of a `Touch` by components."""
+
+    position: Vector
+    normal: Vector
+    distance: Array
+
+
+def collected(points: list[Point]) -> Touch:
+    """The slots of a touch."""
+    return Touch(
+        jnp.stack([point.position.stacked() for point in points]),
+        jnp.stack([point.normal.stacked() for point in points]),
+        jnp.stack([point.distance for point in points]),
+    )

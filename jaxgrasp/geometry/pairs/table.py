@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 
+import jax
+
+from jaxgrasp.fence import fences
 from jaxgrasp.geometry.pairs.capsule_box import capsule_box
 from jaxgrasp.geometry.pairs.convex import convex
-from jaxgrasp.geometry.pairs.geom import Geom, Touch
+from jaxgrasp.geometry.pairs.geom import Body, Geom, Point, Touch, collected
 from jaxgrasp.geometry.pairs.round_pairs import capsule_capsule, sphere_with
 from jaxgrasp.geometry.pairs.surfaces import to_box, to_capsule, to_cylinder, to_ellipsoid, to_sphere
 
-_PAIRS: dict[tuple[str, str], tuple[int, Callable[[Geom, Geom], Touch]]] = {
+_PAIRS: dict[tuple[str, str], tuple[int, Callable[[Body, Body], list[Point]]]] = {
     # One point, from the signed distance of the sphere's centre.
     ("sphere", "sphere"): (1, sphere_with(to_sphere)),
     ("sphere", "capsule"): (1, sphere_with(to_capsule)),
@@ -61,13 +64,14 @@ def touch(kind_a: str, kind_b: str, a: Geom, b: Geom) -> Touch:
         ValueError: the table has no such pair.
     """
     _, function = _entry(kind_a, kind_b)
-    if (kind_a, kind_b) in _PAIRS:
-        return function(a, b)
-    swapped = function(b, a)
-    return swapped._replace(normal=-swapped.normal)
+    swapped = (kind_a, kind_b) not in _PAIRS
+    bodies = (Body.of(b), Body.of(a)) if swapped else (Body.of(a), Body.of(b))
+    with fences(jax.default_backend() == "cpu"):
+        found = collected(function(*bodies))
+    return found._replace(normal=-found.normal) if swapped else found
 
 
-def _entry(kind_a: str, kind_b: str) -> tuple[int, Callable[[Geom, Geom], Touch]]:
+def _entry(kind_a: str, kind_b: str) -> tuple[int, Callable[[Body, Body], list[Point]]]:
     for pair in ((kind_a, kind_b), (kind_b, kind_a)):
         if pair in _PAIRS:
             return _PAIRS[pair]
