@@ -48,13 +48,43 @@ class Actuators:
         return jnp.where(gain == 0, jnp.nan, (force - bias - slope * length) / jnp.where(gain == 0, 1, gain))
 
     def _constants(self, like: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        affine = np.array([_affine(model, a) for a in numbers]).reshape(-1, 3)
+        gain, bias, slope = (jnp.asarray(x, like.dtype) for x in (self.gain, self.bias, self.slope))
+        return gain, bias, slope
 
+
+def read_actuators(model: mujoco.MjModel, dofs: np.ndarray) -> Actuators:
+    """Reads the actuators that move a hand.
+
+    Args:
+        model: The scene.
+        dofs: Degrees of freedom of the hand's joints.
+
+    Raises:
+        ValueError: An actuator (it is named) whose force at rest is not affine in its command, that acts by something
+            else than joints and tendons, or with a limit that this cannot express.
+    """
+    moment = _moments(model)
+    numbers, constant = [], True
+    for a in range(model.nu):
+        kind = mujoco.mjtTrn(model.actuator_trntype[a])
+        if kind in _JOINTS:
+            moves = model.jnt_dofadr[model.actuator_trnid[a, 0]] in dofs
+        elif kind == mujoco.mjtTrn.mjTRN_TENDON:
+            moves = bool(np.any(moment[a, dofs]))
+            constant &= not moves or _is_fixed(model, model.actuator_trnid[a, 0])
+        else:
+            raise ValueError(
+                f"scene: actuator {_name(model, a)} acts by {kind.name[6:].lower()}; wanted joint or tendon"
+            )
+        if moves:
+            numbers.append(a)
+    numbers = np.array(numbers, int)
+    affine = np.array([_affine(model, a) for a in numbers]).reshape(-1, 3)
     unlimited = np.array([-np.inf, np.inf])
     limited = lambda flags, ranges: np.where(flags[numbers, None], ranges[numbers], unlimited)  # noqa: E731
     command = limited(model.actuator_ctrllimited, model.actuator_ctrlrange)
     for row, a in enumerate(numbers):
-        if model.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
+        if model.actuator_dyntype[a] == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):
             command[row] = model.actuator_actrange[a] if model.actuator_actlimited[a] else unlimited
     force = limited(model.actuator_forcelimited, model.actuator_forcerange)
     return Actuators(
@@ -97,7 +127,7 @@ def _moments(model: mujoco.MjModel) -> np.ndarray:
 
 def _is_fixed(model: mujoco.MjModel, tendon: int) -> bool:
     first = model.tendon_adr[tendon]
-    return bool(np.all(model.wrap_type[first : first + model.tendon_num[tendon]] == mujoco.mjtWrap.mjWRAP_JOINT))
+    return bool(np.all(model.wrap_type[first : first + model.tendon_num[tendon]] == int(mujoco.mjtWrap.mjWRAP_JOINT)))
 
 
 def _joint_limits(

@@ -89,7 +89,7 @@ def read_couplings(model: mujoco.MjModel, dofs: np.ndarray) -> Couplings:
 
 def _holds_a_base(model: mujoco.MjModel, equality: int) -> bool:
     """Whether a weld only holds a free body, the base of a hand for example, in its place."""
-    if model.eq_objtype[equality] != mujoco.mjtObj.mjOBJ_BODY:
+    if model.eq_objtype[equality] != int(mujoco.mjtObj.mjOBJ_BODY):
         return False
-    free = set(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
+    free = set(model.jnt_bodyid[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)].tolist())
     return bool(free & {int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])})

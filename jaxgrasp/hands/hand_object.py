@@ -18,12 +18,12 @@ from jaxgrasp.contact import Actuation, Contacts, required_wrench
 from jaxgrasp.hands.actuators import Actuators, read_actuators
 from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.grasps import HandGrasps
-from jaxgrasp.hands.kinematics import Kinematics, Pose
+from jaxgrasp.hands.kinematics import FREE, HINGE, SLIDE, Kinematics, Poses, matrices, place
+from jaxgrasp.hands.tendons import spatial_lengths
 from jaxgrasp.hands.touching import PairTable, Points, pair_table, touching_points
 
 # Quaternions are normalised; farther from 1 than this they are taken for a mistake.
 _QUATERNION_TOLERANCE = 1e-3
-_MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,10 +91,7 @@ class HandObject:
         hand = np.arange(1, model.nbody) if hand_body is None else _below(model, _body(model, "hand_body", hand_body))
         hand = np.setdiff1d(hand, of_object)
         joints = np.flatnonzero(np.isin(model.jnt_bodyid, hand))
-        for joint in joints:
-            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
-                raise ValueError(f"scene: joint {model.joint(joint).name!r} is a ball; wanted hinges and slides")
-        joints = joints[np.isin(model.jnt_type[joints], _MOVING)]
+        joints = joints[np.isin(model.jnt_type[joints], (HINGE, SLIDE))]
         dofs = model.jnt_dofadr[joints]
         return cls(
             model=model,
@@ -202,10 +199,10 @@ class HandObject:
         """For (n, nq)."""
         admissible = self._admissible(qpos)
         safe = jnp.where(admissible[:, None], qpos, jnp.asarray(self.model.qpos0, qpos.dtype))
-        pose = self._kinematics.poses(safe)
-        rotation = pose.body_rotations[:, self.object_body]
-        centre = self._mass_centre(pose)
-        points, friction, links = self._points(pose)
+        poses = self._kinematics.poses(safe.T)
+        rotation = jnp.moveaxis(poses.rotations[:, :, self.object_body], -1, 0)
+        centre = self._mass_centre(poses)
+        points, friction, links = self._points(poses)
         touching = points.distance <= self.contact_distance
         distances, chosen = lax.top_k(-points.distance, min(self.max_contacts, points.distance.shape[-1]))
         pick = lambda x: jnp.take_along_axis(x, chosen[..., None], 1)  # noqa: E731
@@ -224,7 +221,7 @@ class HandObject:
         mass = float(self.model.body_mass[_below(self.model, self.object_body)].sum())
         gravity = jnp.einsum("nji,j->ni", rotation, jnp.asarray(self.model.opt.gravity, qpos.dtype))
         weight = required_wrench(mass, gravity=gravity)
-        lengths, actuation, stiffness = self._transmission(safe, pose, world, rotation, contacts.frames, links)
+        lengths, actuation, stiffness = self._transmission(safe, poses, world, rotation, contacts.frames, links)
         return HandGrasps(
             contacts=contacts,
             distances=distances,
@@ -241,29 +238,28 @@ class HandObject:
 
     def _admissible(self, qpos: jax.Array) -> jax.Array:
         fine = jnp.isfinite(qpos).all(-1)
-        for joint, kind in enumerate(self.model.jnt_type):
-            if kind in _MOVING:
-                continue
-            start = self.model.jnt_qposadr[joint] + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 0)
-            norm = safe_norm(qpos[:, start : start + 4])
-            fine &= jnp.abs(norm - 1) <= _QUATERNION_TOLERANCE
+        for joint in np.flatnonzero(self.model.jnt_type == FREE):
+            start = self.model.jnt_qposadr[joint] + 3
+            fine &= jnp.abs(safe_norm(qpos[:, start : start + 4]) - 1) <= _QUATERNION_TOLERANCE
         return fine
 
-    def _mass_centre(self, pose: Pose) -> jax.Array:
+    def _mass_centre(self, poses: Poses) -> jax.Array:
+        """(n, 3)."""
         bodies = _below(self.model, self.object_body)
-        masses = self.model.body_mass[bodies]
-        if masses.sum() == 0:
-            return pose.mass_centres[:, self.object_body]
-        return jnp.einsum(
-            "b,nbi->ni", jnp.asarray(masses / masses.sum(), pose.anchors.dtype), pose.mass_centres[:, bodies]
-        )
+        # An object that is fixed to the world may have no mass.
+        masses = np.maximum(self.model.body_mass[bodies], 1e-12)
+        offsets, turns = self.model.body_ipos[bodies].T, np.repeat(np.eye(3)[..., None], len(bodies), -1)
+        centres = place(poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, turns)[1]
+        return jnp.einsum("b,ibn->ni", jnp.asarray(masses / masses.sum(), centres.dtype), centres)
 
-    def _points(self, pose: Pose) -> tuple[Points, np.ndarray, np.ndarray]:
+    def _points(self, poses: Poses) -> tuple[Points, np.ndarray, np.ndarray]:
         """Points (n, slots, ...), and friction and link of every slot."""
-        table = self._table
-        lanes_last = lambda x: jnp.moveaxis(x, 0, -1)  # noqa: E731
-        found = touching_points(table, lanes_last(pose.geom_positions), lanes_last(pose.geom_rotations))
-        points = Points(*[jnp.moveaxis(x, -1, 0) for x in found])
+        table, model = self._table, self.model
+        bodies, offsets = model.geom_bodyid[table.geoms], model.geom_pos[table.geoms].T
+        rotations, positions = place(
+            poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, matrices(model.geom_quat[table.geoms])
+        )
+        points = Points(*[jnp.moveaxis(x, -1, 0) for x in touching_points(table, positions, rotations)])
         if self.merge is None:
             return points, table.friction, table.link
         merged, friction, links = [], [], np.unique(table.link)
@@ -291,7 +287,7 @@ class HandObject:
     def _transmission(
         self,
         qpos: jax.Array,
-        pose: Pose,
+        poses: Poses,
         world: jax.Array,
         rotation: jax.Array,
         frames: jax.Array,
@@ -299,8 +295,8 @@ class HandObject:
     ) -> tuple[jax.Array, Actuation, jax.Array]:
         """Actuator lengths, actuation and joint stiffness; `world` (n, n_c, 3) are the contacts."""
         model, dtype = self.model, qpos.dtype
-        axes, anchors = pose.axes[:, None, self.joints], pose.anchors[:, None, self.joints]
-        hinge = jnp.asarray(model.jnt_type[self.joints] == mujoco.mjtJoint.mjJNT_HINGE)
+        axes, anchors = (x[:, self.joints].T[:, None] for x in (poses.axes, poses.anchors))
+        hinge = jnp.asarray(model.jnt_type[self.joints] == HINGE)
         turning = jnp.cross(axes, world[:, :, None] - anchors)
         moves = jnp.asarray(_moved_bodies(model, self.joints))[links]
         velocity = jnp.where(moves[..., None], jnp.where(hinge[:, None], turning, axes), 0)
@@ -340,12 +336,13 @@ class HandObject:
             rest = jnp.asarray(self.model.qpos0[self.model.jnt_qposadr[self.joints]], qpos.dtype)
             return start + (joints - rest) @ jnp.asarray(constant, qpos.dtype), constant
 
-        def lengths(change: jax.Array) -> jax.Array:
-            moved = qpos.at[:, self.model.jnt_qposadr[self.joints]].add(change)
-            return self._kinematics.actuator_lengths(moved)[:, numbers]
+        lengths = spatial_lengths(self.model)
 
-        zero = jnp.zeros(len(self.dofs), qpos.dtype)
-        return lengths(zero), jnp.moveaxis(jax.jacfwd(lengths)(zero), -1, -2)
+        def of_joints(qpos: jax.Array, joints: jax.Array) -> jax.Array:
+            return lengths(qpos.at[self.model.jnt_qposadr[self.joints]].set(joints))[numbers]
+
+        arms = jax.vmap(jax.jacfwd(of_joints, argnums=1))(qpos, joints)
+        return jax.vmap(of_joints)(qpos, joints), jnp.swapaxes(arms, -1, -2)
 
 
 def _read(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:

@@ -26,7 +26,7 @@ class Group:
 
     kinds: tuple[str, str]
     hand: np.ndarray
-    """(pairs,), geoms of the hand."""
+    """(pairs,), geoms of the hand, by their place in `PairTable.geoms`."""
     object: np.ndarray
     """(pairs,), geoms of the object."""
     hulls: tuple[Hull | None, Hull | None]
@@ -48,6 +48,8 @@ class PairTable:
     """The pairs of a scene in groups, and what is known of every slot beforehand."""
 
     groups: tuple[Group, ...]
+    geoms: np.ndarray
+    """The geoms that take part, their numbers in the model."""
     sizes: np.ndarray
     """(geoms, 3), MuJoCo's sizes."""
     link: np.ndarray
@@ -79,13 +81,15 @@ def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> P
             "wanted contype and conaffinity that let some of them collide"
         )
     groups, link, mu = [], [], []
+    used = np.unique([pair for pairs in found.values() for pair in pairs])
     for (kinds, meshes), pairs in found.items():
         geoms = np.array(pairs)
-        groups.append(Group(kinds, geoms[:, 0], geoms[:, 1], tuple(None if m < 0 else _hull(model, m) for m in meshes)))
+        hulls = tuple(None if m < 0 else _hull(model, m) for m in meshes)
+        groups.append(Group(kinds, *np.searchsorted(used, geoms).T, hulls))
         count = slots(*kinds)
         link.append(np.tile(model.geom_bodyid[geoms[:, 0]], count))
         mu.append(np.tile([friction[pair] for pair in pairs], count))
-    return PairTable(tuple(groups), model.geom_size, np.concatenate(link), np.concatenate(mu))
+    return PairTable(tuple(groups), used, model.geom_size[used], np.concatenate(link), np.concatenate(mu))
 
 
 def touching_points(table: PairTable, positions: jax.Array, rotations: jax.Array) -> Points:
@@ -93,8 +97,8 @@ def touching_points(table: PairTable, positions: jax.Array, rotations: jax.Array
 
     Args:
         table: The pairs.
-        positions: (geoms, 3, *lanes), of the geoms' frames, m, world frame.
-        rotations: (geoms, 3, 3, *lanes), columns are their axes.
+        positions: (3, geoms, *lanes), of the frames of `PairTable.geoms`, m, world frame.
+        rotations: (3, 3, geoms, *lanes), columns are their axes.
     """
     found = []
     for group in table.groups:
@@ -119,8 +123,8 @@ def _geoms(table: PairTable, positions: jax.Array, rotations: jax.Array, geoms: 
     lanes = positions.shape[2:]
     size = jnp.asarray(table.sizes[geoms].T, positions.dtype).reshape(3, len(geoms), *[1] * len(lanes))
     return Geom(
-        position=jnp.moveaxis(positions[geoms], 0, 1),
-        rotation=jnp.moveaxis(rotations[geoms], 0, 2),
+        position=positions[:, geoms],
+        rotation=rotations[:, :, geoms],
         size=jnp.broadcast_to(size, (3, len(geoms), *lanes)),
         hull=hull,
     )

@@ -77,8 +77,8 @@ def limited(actuated: Actuated, friction: jax.Array, max_force: jax.Array) -> Ac
     With |f_t| <= mu f_max and |f_n| <= f_max in every contact, no effort needs to be larger.
     """
     reach = jnp.stack([friction, friction, jnp.ones_like(friction)]) * max_force
-    torque = jnp.einsum("van...,an...->v...", jnp.abs(actuated.joints), reach)
-    needed = jnp.einsum("uv...,v...->u...", jnp.abs(actuated.inverse), torque)
+    torque = _torques(jnp.abs(actuated.joints), reach)
+    needed = _times(jnp.abs(actuated.inverse), torque)
     # Where actuators oppose each other, one may have to make up for all the others.
     direct = jnp.abs(actuated.transmission)
     alone = fold(jnp.maximum, torque[:, None] / jnp.where(direct > 0, direct, jnp.inf))
@@ -93,7 +93,7 @@ def stacked_rows(columns: jax.Array, actuated: Actuated | None) -> jax.Array:
     """G (6, 3, n, *lanes), and below it N'J' where actuators do not reach every joint direction."""
     if actuated is None or actuated.unreached is None:
         return columns
-    bare = jnp.einsum("rv...,van...->ran...", actuated.unreached, actuated.joints)
+    bare = _times(actuated.unreached, actuated.joints)
     return jnp.concatenate([columns, bare])
 
 
@@ -104,13 +104,24 @@ def effort_reach(actuated: Actuated, inverse: jax.Array, units: jax.Array) -> ja
     def spread(inverse: jax.Array) -> jax.Array:
         def component(one: tuple) -> jax.Array:
             column, unit = one
-            torque = jnp.einsum("van...,an...->v...", actuated.joints, column)
-            effort = jnp.einsum("uv...,v...->u...", actuated.inverse, torque) * unit
+            effort = _times(actuated.inverse, _torques(actuated.joints, column)) * unit
             return jnp.stack([-effort, effort])
 
         return each(component, (jnp.moveaxis(inverse, 1, 0), units))
 
     return spread(inverse)
+
+
+def _torques(joints: jax.Array, forces: jax.Array) -> jax.Array:
+    """J'f (n_v, *lanes) from (n_v, 3, n, *lanes) and (3, n, *lanes). Spelt out: a product would be a library call."""
+    return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(joints * forces, 1, 0)), 1, 0))
+
+
+def _times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """(r, c, *lanes) times (c, ..., *lanes)."""
+    columns = jnp.moveaxis(matrix, 1, 0)
+    spread = [c.reshape(c.shape[0], *[1] * (vector.ndim - c.ndim), *c.shape[1:]) for c in columns]
+    return fold(jnp.add, [c * v for c, v in zip(spread, vector, strict=True)])
 
 
 class Joined(NamedTuple):

@@ -162,12 +162,16 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
         return _admit(raw, terms.terms, extents)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = not {"compliance", "per_vertex", "weights", "jacobian"} & set(arguments)
-    lanes = Lanes(admit, shared, n * (kernel.rows + 1), compact)
+    compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
+    rows = n * (kernel.rows + 1)
+    if given["actuation"] is not None:
+        rows = max(rows, ROWS)
+    lanes = Lanes(admit, shared, rows, compact)
     out = differentiable(kernel, lanes, arguments)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
+ROWS = 144
 _CONTACT_LEAVES = ("positions", "frames", "friction", "max_force", "active")
 _PUBLIC = {
     "wrench": "required_wrench",
@@ -290,9 +294,11 @@ def _sound_actuation(raw: dict[str, jax.Array], active: jax.Array) -> jax.Array:
     """Whether everything that is used is finite, and no limits cross, (*lanes)."""
     if "jacobian" not in raw:
         return jnp.array(True)
-    sound = (jnp.isfinite(raw["jacobian"]).all((1, 2)) | ~active).all(0)
-    for name in _TRANSMISSION & set(raw):
-        sound &= jnp.isfinite(raw[name]).all((0, 1))
+    # A sum is finite where all of its terms are. Spelt out: large reductions are library calls.
+    total = lambda x: fold(jnp.add, fold(jnp.add, jnp.abs(x)))  # noqa: E731
+    sound = (jnp.isfinite(total(jnp.moveaxis(raw["jacobian"], 0, 2))) | ~active).all(0)
+    for name in sorted(_TRANSMISSION & set(raw)):
+        sound &= jnp.isfinite(total(raw[name]))
     return sound & ((raw["lower"] <= raw["upper"]) & (raw["lower"] < jnp.inf) & (raw["upper"] > -jnp.inf)).all(0)
 
 
@@ -305,7 +311,7 @@ def _actuated(
     max_force: jax.Array,
 ) -> Actuated:
     jacobian = jnp.where(there[:, None, None], raw["jacobian"], 0)
-    sane = {name: jnp.where(valid, raw[name], 0) for name in _TRANSMISSION & set(raw)}
+    sane = {name: jnp.where(valid, raw[name], 0) for name in sorted(_TRANSMISSION & set(raw))}
     actuated = Actuated(
         joints=jnp.moveaxis(jacobian, (2, 1, 0), (0, 1, 2)) / length,
         transmission=sane["transmission"] / length,

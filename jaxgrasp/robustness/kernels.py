@@ -120,8 +120,10 @@ class Along:
             admitted, pull = jax.vjp(at, start)
             return pull(adjoint(admitted, held, cotangents, names))[0]
 
-        # With respect to the set itself there are reductions, and roots of matrices are library calls.
-        compact = self.lanes.compact and not any(name.startswith("term") for name in names)
+        # With respect to the set itself there are reductions, and roots of matrices are library calls; what comes with
+        # actuators is JAX's own transpose.
+        compact = self.lanes.compact and "jacobian" not in self.arguments
+        compact &= not any(name.startswith("term") for name in names)
         shared = (self.lanes.shared, jax.tree.map(lambda _: False, held))
         rows = self.lanes.rows if compact else 0
         return transposed_lanes(back, (self.arguments, held), self.moved, shared, like, rows)
