@@ -191,6 +191,33 @@ class HandObject:
             tall.shape[-2], dtype=tall.dtype
         )
 
+    @property
+    def slot_links(self) -> np.ndarray:
+        """(slots,), the body of the hand of every point that `approach` looks at."""
+        return self._table.link
+
+    @cached_property
+    def moved_bodies(self) -> np.ndarray:
+        """(bodies, joints), bool: which of `joints` move a body."""
+        moved = np.zeros((self.model.nbody, len(self.joints)), bool)
+        for body in range(1, self.model.nbody):
+            moved[body] = moved[self.model.body_parentid[body]] | (self.model.jnt_bodyid[self.joints] == body)
+        return moved
+
+    def approach(self, qpos: Float[Array, "n nq"]) -> tuple[Points, Float[Array, "n slots joints"]]:
+        """All points where geoms touch or come near, and how fast each joint moves them apart.
+
+        Args:
+            qpos: Configurations.
+
+        Returns:
+            Points (n, slots, ...), world frame, and d distance / d joint position, m/rad or 1, while the object rests.
+        """
+        poses = self._kinematics.poses(qpos.T)
+        points = self._slots(poses)
+        velocity = self._velocities(poses, points.position, self.moved_bodies[self.slot_links])
+        return points, jnp.einsum("nsvi,nsi->nsv", velocity, points.normal)
+
     @cached_property
     def _compiled(self):
         return compiled(self._grasps)
@@ -252,14 +279,18 @@ class HandObject:
         centres = place(poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, turns)[1]
         return jnp.einsum("b,ibn->ni", jnp.asarray(masses / masses.sum(), centres.dtype), centres)
 
-    def _points(self, poses: Poses) -> tuple[Points, np.ndarray, np.ndarray]:
-        """Points (n, slots, ...), and friction and link of every slot."""
+    def _slots(self, poses: Poses) -> Points:
+        """Points (n, slots, ...)."""
         table, model = self._table, self.model
         bodies, offsets = model.geom_bodyid[table.geoms], model.geom_pos[table.geoms].T
         rotations, positions = place(
             poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, matrices(model.geom_quat[table.geoms])
         )
-        points = Points(*[jnp.moveaxis(x, -1, 0) for x in touching_points(table, positions, rotations)])
+        return Points(*[jnp.moveaxis(x, -1, 0) for x in touching_points(table, positions, rotations)])
+
+    def _points(self, poses: Poses) -> tuple[Points, np.ndarray, np.ndarray]:
+        """Points (n, slots, ...), and friction and link of every slot."""
+        table, points = self._table, self._slots(poses)
         if self.merge is None:
             return points, table.friction, table.link
         merged, friction, links = [], [], np.unique(table.link)
@@ -295,11 +326,7 @@ class HandObject:
     ) -> tuple[jax.Array, Actuation, jax.Array]:
         """Actuator lengths, actuation and joint stiffness; `world` (n, n_c, 3) are the contacts."""
         model, dtype = self.model, qpos.dtype
-        axes, anchors = (x[:, self.joints].T[:, None] for x in (poses.axes, poses.anchors))
-        hinge = jnp.asarray(model.jnt_type[self.joints] == HINGE)
-        turning = jnp.cross(axes, world[:, :, None] - anchors)
-        moves = jnp.asarray(_moved_bodies(model, self.joints))[links]
-        velocity = jnp.where(moves[..., None], jnp.where(hinge[:, None], turning, axes), 0)
+        velocity = self._velocities(poses, world, jnp.asarray(self.moved_bodies)[links])
         turned = jnp.einsum("nji,ncvj->ncvi", rotation, velocity)
         # Contacts that are not admissible have no frames.
         jacobian = jnp.einsum("ncia,ncvi->ncav", jnp.where(jnp.isnan(frames), 0, frames), turned)
@@ -325,6 +352,13 @@ class HandObject:
         if actuation.unreached is not None:
             whole["unreached"] = spread(actuation.unreached, 2)
         return lengths, replace(actuation, **whole), spread(stiffness, 2)
+
+    def _velocities(self, poses: Poses, points: jax.Array, moved: jax.Array | np.ndarray) -> jax.Array:
+        """Velocities (n, k, joints, 3) of points (n, k, 3) on the hand, by the joints that move them."""
+        axes, anchors = (x[:, self.joints].T[:, None] for x in (poses.axes, poses.anchors))
+        hinge = jnp.asarray(self.model.jnt_type[self.joints] == HINGE)[:, None]
+        turning = jnp.cross(axes, points[:, :, None] - anchors)
+        return jnp.where(jnp.asarray(moved)[..., None], jnp.where(hinge, turning, axes), 0)
 
     def _lengths(self, qpos: jax.Array, joints: jax.Array) -> tuple[jax.Array, jax.Array | np.ndarray]:
         """Lengths (n, actuators) and B, (joints, actuators) where it is the same everywhere."""
@@ -370,11 +404,3 @@ def _below(model: mujoco.MjModel, body: int) -> np.ndarray:
         if int(model.body_parentid[other]) in inside:
             inside.add(other)
     return np.array(sorted(inside))
-
-
-def _moved_bodies(model: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
-    """(bodies, joints), bool: which joints move a body."""
-    moved = np.zeros((model.nbody, len(joints)), bool)
-    for body in range(1, model.nbody):
-        moved[body] = moved[model.body_parentid[body]] | (model.jnt_bodyid[joints] == body)
-    return moved
