@@ -135,7 +135,7 @@ def test_the_ring_hand_holds_an_object_in_gravity(name):
 
 
 def test_outer_joints_of_the_shadow_hand_are_coupled():
-    free, coupled = shadow_hand(coupled_tendons=False).compile(), shadow_hand().compile()
+    free, coupled = shadow_hand().compile(), shadow_hand(coupled_tendons=True).compile()
     assert (free.nu, free.ntendon) == (24, 0)
     assert (coupled.nu, coupled.ntendon) == (20, 4)
     data = mujoco.MjData(coupled)

@@ -18,7 +18,7 @@ _COUPLED_FINGERS = ("FF", "MF", "RF", "LF")
 
 
 def shadow_hand(
-    object: str | Path = "sphere", size: float | None = None, coupled_tendons: bool = True
+    object: str | Path = "sphere", size: float | None = None, coupled_tendons: bool = False
 ) -> mujoco.MjSpec:
     """The right Shadow Hand that comes with the package mujoco-mjx, its palm up, and an object above the palm.
 

@@ -1,6 +1,7 @@
 """From the public, batch-first arguments to the lanes that the kernels work on, with every check of the data."""
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
+from jaxgrasp.solvers.lanes import TILE
 
 
 @jax.tree_util.register_dataclass
@@ -165,13 +167,14 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
     compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
     rows = n * (kernel.rows + 1)
     if given["actuation"] is not None:
-        rows = max(rows, ROWS)
+        # The equality rows are what is largest; up to twice as many values were seen to compile.
+        joints, actuators = given["actuation"].transmission.shape[-2:]
+        rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
     lanes = Lanes(admit, shared, rows, compact)
     out = differentiable(kernel, lanes, arguments)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
-ROWS = 144
 _CONTACT_LEAVES = ("positions", "frames", "friction", "max_force", "active")
 _PUBLIC = {
     "wrench": "required_wrench",
