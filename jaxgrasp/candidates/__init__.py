@@ -1,6 +1,6 @@
 """The files that grasps come in by, and a built-in object to sample grasps on."""
 
-from jaxgrasp.candidates.archive import CandidateError
+from jaxgrasp.candidates.archive import CandidateError, read_archive, read_array
 from jaxgrasp.candidates.candidates import Candidates, concatenate
 from jaxgrasp.candidates.reader import read_candidates
 from jaxgrasp.candidates.superquadric import Superquadric, sample_grasps
@@ -11,6 +11,8 @@ __all__ = [
     "Candidates",
     "Superquadric",
     "concatenate",
+    "read_archive",
+    "read_array",
     "read_candidates",
     "read_wrenches",
     "sample_grasps",

@@ -36,6 +36,10 @@ class Candidates:
     mass: Float[np.ndarray, " batch"]
     """Masses of the object, kg; NaN where unknown."""
 
+    hand: dict[str, np.ndarray] = field(default_factory=dict)
+    """What candidates of a hand have beside: `required_wrench`, N and N m; the fields of `Actuation`; and
+    `idle_controls` and `controls_per_effort`, commands of its actuators. Arrays with a leading axis of N, by name."""
+
     columns: dict[str, np.ndarray] = field(default_factory=dict)
     """What travels along into the table: arrays with a leading axis of N, by name."""
 
@@ -79,6 +83,7 @@ class Candidates:
             max_force=self.max_force[rows],
             active=self.active[rows],
             mass=self.mass[rows],
+            hand={name: column[rows] for name, column in self.hand.items()},
             columns={name: column[rows] for name, column in self.columns.items()},
             sources=self.sources,
             source=self.source[rows],

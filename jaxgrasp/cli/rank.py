@@ -2,18 +2,20 @@
 
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from jaxgrasp.cli.problems import CommandError, check_output, write_files
+from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.disturbance import DisturbanceSet
+    from jaxgrasp.hands import HandObject
     from jaxgrasp.ranking import Ranking
 
 SAMPLED = 10_000
@@ -25,7 +27,8 @@ class Rank:
 
     Reads .npz files with positions (N, n_c, 3), in m about the centre of mass, and outward_normals (N, n_c, 3) or
     frames (N, n_c, 3, 3), and where present friction, max_force, mass, center_of_mass and active; other columns travel
-    along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object.
+    along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object. With --scene the
+    candidates are configurations of a hand.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -60,6 +63,8 @@ class Rank:
     figure: Path | None = Path("ranking.png")
     """The figure to write, .png, .svg or .pdf; None for no figure."""
 
+    of_hand: Annotated[Scene, tyro.conf.arg(name="")] = field(default_factory=Scene)
+
     def run(self) -> int:
         """Ranks, writes and prints.
 
@@ -74,12 +79,13 @@ class Rank:
         configure_jax()
         from jaxgrasp.candidates import CandidateError
 
+        hand = self.of_hand.hand(self.friction, self.max_force) if self.of_hand.scene else None
         try:
-            candidates = self._candidates()
             disturbances, unit = named_disturbances(self.disturbances)
+            candidates = self._candidates() if hand is None else self.of_hand.candidates(hand)
         except CandidateError as error:
             raise CommandError(str(error)) from error
-        return self._rank(candidates, disturbances, unit)
+        return self._rank(candidates, disturbances, unit, hand)
 
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
@@ -95,10 +101,15 @@ class Rank:
         for option, value, admissible, wanted in checks:
             if not admissible:
                 raise CommandError(f"{option}: got {value}; wanted {wanted}")
-        inputs = [*self.files, Path(self.disturbances)]
+        self.of_hand.check()
+        if self.of_hand.scene and (self.files or self.gravity):
+            what = "files of contacts" if self.files else "--gravity"
+            raise CommandError(f"--scene: got {what}, too; wanted the scene's own contacts and gravity alone")
+        inputs = [*self.files, Path(self.disturbances), Path(self.of_hand.scene or ""), self.of_hand.qpos or Path()]
         for option, path, endings in (
             ("--output", self.output, TABLE_ENDINGS),
             ("--figure", self.figure, FIGURE_ENDINGS),
+            ("--picture", self.of_hand.picture if self.of_hand.scene else None, FIGURE_ENDINGS),
         ):
             if path is not None:
                 check_output(path, option, endings, inputs)
@@ -116,7 +127,9 @@ class Rank:
             max_force=10.0 if self.max_force is None else self.max_force,
         )
 
-    def _rank(self, candidates: "Candidates", disturbances: "DisturbanceSet", unit: str) -> int:
+    def _rank(
+        self, candidates: "Candidates", disturbances: "DisturbanceSet", unit: str, hand: "HandObject | None"
+    ) -> int:
         from jaxgrasp.cli.report import Clock, print_ranking, progress_bar
         from jaxgrasp.ranking import RankingInterrupted, rank
 
@@ -140,15 +153,18 @@ class Rank:
             print(f"jaxgrasp: {what}: ranked {len(ranking.margin):,} of {len(candidates):,}", file=sys.stderr)
             if len(ranking.margin) == 0:
                 return exit_code
-        written, failed = self._write(ranking, unit)
+        written, failed = self._write(ranking, unit, hand)
         print_ranking(ranking, unit, clock, written)
         return exit_code or (2 if failed else 0)
 
-    def _write(self, ranking: "Ranking", unit: str) -> tuple[list[Path], bool]:
+    def _write(self, ranking: "Ranking", unit: str, hand: "HandObject | None") -> tuple[list[Path], bool]:
         from jaxgrasp.ranking import write_table
         from jaxgrasp.viewer import figure_of_ranking, write_figure
 
         def write_picture(path: Path) -> None:
             write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity)), path)
 
-        return write_files((self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture))
+        jobs = [(self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture)]
+        if hand is not None:
+            jobs.append((self.of_hand.picture, lambda path: self.of_hand.draw(hand, ranking, unit, path)))
+        return write_files(*jobs)

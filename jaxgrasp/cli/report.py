@@ -66,6 +66,24 @@ def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
+def counting_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Shows a bar on standard error where that is a terminal.
+
+    Args:
+        what: What is being done.
+        total: How often.
+
+    Yields:
+        What to call with how often it was done.
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, completed=done)
+
+
+@contextlib.contextmanager
 def ascent_bar(steps: int) -> Iterator[Callable[[int, Record], None]]:
     """Shows a bar on standard error where that is a terminal, with the median and the best margin so far.
 

@@ -124,6 +124,16 @@ class HandObject:
         """The actuators of `HandGrasps.actuation`, in order."""
         return tuple(self.model.actuator(a).name for a in self._actuators.numbers)
 
+    @property
+    def object_mass(self) -> float:
+        """Mass of the object, kg."""
+        return float(self.model.body_mass[_below(self.model, self.object_body)].sum())
+
+    @property
+    def constant_transmission(self) -> bool:
+        """Whether actuators pull at the joints in the same way in every configuration."""
+        return self._actuators.transmission is not None and self._couplings.linear
+
     def grasps(self, qpos: ArrayLike) -> HandGrasps:
         """What the hand does in a batch of configurations.
 
@@ -245,9 +255,8 @@ class HandObject:
             max_force=self.max_force,
             active=(distances <= self.contact_distance) | ~admissible[:, None],
         )
-        mass = float(self.model.body_mass[_below(self.model, self.object_body)].sum())
         gravity = jnp.einsum("nji,j->ni", rotation, jnp.asarray(self.model.opt.gravity, qpos.dtype))
-        weight = required_wrench(mass, gravity=gravity)
+        weight = required_wrench(self.object_mass, gravity=gravity)
         lengths, actuation, stiffness = self._transmission(safe, poses, world, rotation, contacts.frames, links)
         return HandGrasps(
             contacts=contacts,
@@ -338,7 +347,7 @@ class HandObject:
             jacobian = jacobian @ free[:, None]
             transmission = jnp.swapaxes(free, -1, -2) @ transmission
             springs = jnp.swapaxes(free, -1, -2) @ springs @ free
-            if self._couplings.linear and self._actuators.transmission is not None:
+            if self.constant_transmission:
                 transmission = np.asarray(
                     self._couplings.velocities(jnp.zeros(len(self.dofs))).T @ self._actuators.transmission
                 )

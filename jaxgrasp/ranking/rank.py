@@ -50,6 +50,9 @@ class Ranking:
     tightening_status: Int[np.ndarray, " top"]
     """`Status` of (22)."""
 
+    controls: Float[np.ndarray, "top actuators"]
+    """Commands with which a hand's actuators squeeze as hard; NaN where there is no answer."""
+
     @property
     def rank(self) -> Int[np.ndarray, " batch"]:
         """The rank of each candidate; 1 is the best."""
@@ -159,9 +162,9 @@ class _Scores:
         return np.where(np.isin(self.status[rows], _ANSWERED), margin, np.nan)
 
     def ranking(self, candidates: Candidates, share: float, answers: list[tuple[np.ndarray, ...]]) -> Ranking:
-        empty = np.empty((0, candidates.num_contacts, 3))
-        answers = [(empty, empty, np.empty(0), np.empty(0, dtype=int)), *answers]
-        forces, object_forces, effort, tightening_status = map(np.concatenate, zip(*answers, strict=True))
+        empty, actuators = np.empty((0, candidates.num_contacts, 3)), candidates.hand.get("lower", np.empty((0, 0)))
+        answers = [(empty, empty, np.empty(0), np.empty(0, dtype=int), actuators[:0]), *answers]
+        forces, object_forces, effort, tightening_status, controls = map(np.concatenate, zip(*answers, strict=True))
         return Ranking(
             candidates=candidates.take(slice(self.done)),
             margin=self.margin[: self.done],
@@ -173,4 +176,5 @@ class _Scores:
             object_forces=object_forces,
             effort=effort,
             tightening_status=tightening_status,
+            controls=controls,
         )

@@ -26,8 +26,8 @@ def ranking_table(ranking: Ranking, ranks: slice = slice(None)) -> dict[str, np.
     Returns:
         Arrays with a leading axis of N by name: rank; source and index, the file and the row in it; margin and
         upper_bound, multiples of the disturbance set; status; effort, N^2, and forces (N, n_c, 3), N, on the object in
-        its frame, NaN for all but the best; mass where any is known; and what travelled along, with `input_` before a
-        name that the table has itself.
+        its frame, NaN for all but the best, like the controls (N, n_u) of a hand; mass where any is known; and what
+        travelled along, with `input_` before a name that the table has itself.
     """
     candidates, order = ranking.candidates, ranking.order[ranks]
     rank = np.arange(1, len(ranking.order) + 1)[ranks]
@@ -46,6 +46,10 @@ def ranking_table(ranking: Ranking, ranks: slice = slice(None)) -> dict[str, np.
         "effort": effort,
         "forces": forces,
     }
+    if ranking.controls.shape[-1]:
+        controls = np.full((len(order), ranking.controls.shape[-1]), np.nan)
+        controls[: len(answers)] = ranking.controls[answers]
+        table["controls"] = controls
     if not np.isnan(candidates.mass).all():
         table["mass"] = candidates.mass[order]
     for name, column in candidates.columns.items():

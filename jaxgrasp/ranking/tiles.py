@@ -1,5 +1,6 @@
 """Solves for many candidates in tiles of bounded memory, each spread over the devices of this process."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator
@@ -10,11 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array
 
 from jaxgrasp.candidates import Candidates
 from jaxgrasp.compiling import compiled
-from jaxgrasp.contact import Contacts, required_wrench
+from jaxgrasp.contact import Actuation, Contacts, required_wrench
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness import largest_disturbance, least_effort
 
@@ -42,7 +42,7 @@ def columns_of(candidates: Candidates) -> Columns:
         columns["frames"] = candidates.frames
     if candidates.outward_normals is not None:
         columns["outward_normals"] = candidates.outward_normals
-    return columns
+    return columns | candidates.hand
 
 
 def solve_in_tiles(
@@ -60,7 +60,7 @@ def solve_in_tiles(
         solver: `margins` or `tightening`.
         columns: What it needs of each candidate, with a leading axis of N.
         disturbances: The set, the same for all.
-        gravity: Along the object's -z, m/s^2; zero means that nothing need be borne.
+        gravity: Along the object's -z, m/s^2; zero means that no weight but that of `required_wrench` need be borne.
         cone_edges: Edges of the friction pyramid.
         tile: Candidates at a time, at most; None chooses by platform.
 
@@ -80,18 +80,24 @@ def solve_in_tiles(
         yield slice(start, stop), jax.tree.map(lambda leaf, n=stop - start: np.asarray(leaf)[:n], answer)
 
 
-def margins(contacts: Contacts, disturbances: DisturbanceSet, load: Array | None, cone_edges: int, _: Any) -> Any:
+def margins(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str, Any], _: Any) -> Any:
     """Solves (21): margin, upper bound, status."""
-    solution = largest_disturbance(contacts, disturbances, required_wrench=load, cone_edges=cone_edges)
+    solution = largest_disturbance(contacts, disturbances, **task)
     return solution.margin, solution.upper_bound, solution.status
 
 
-def tightening(
-    contacts: Contacts, disturbances: DisturbanceSet, load: Array | None, cone_edges: int, columns: Any
-) -> Any:
-    """Solves (22) at the margins of the column `wanted`: forces in contact and in object frames, effort, status."""
-    solution = least_effort(contacts, disturbances, columns["wanted"], required_wrench=load, cone_edges=cone_edges)
-    return solution.forces, solution.forces_in_object_frame(contacts), solution.effort, solution.status
+def tightening(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str, Any], columns: Any) -> Any:
+    """Solves (22) at the margins of the column `wanted`.
+
+    Returns:
+        Forces in contact and in object frames, effort, status, and the commands of a hand's actuators, of which there
+        may be none.
+    """
+    solution = least_effort(contacts, disturbances, columns["wanted"], **task)
+    controls = jnp.zeros((len(solution.effort), 0), solution.effort.dtype)
+    if "controls_per_effort" in columns:
+        controls = columns["idle_controls"] + columns["controls_per_effort"] * solution.actuator_efforts
+    return solution.forces, solution.forces_in_object_frame(contacts), solution.effort, solution.status, controls
 
 
 @functools.partial(compiled, static_argnums=(3, 4, 5, 6))
@@ -107,10 +113,14 @@ def _solve_tile(
             max_force=columns["max_force"],
             active=columns["active"],
         )
-        load = None
+        load = columns.get("required_wrench")
         if loaded:
             load = required_wrench(columns["mass"], gravity=jnp.array([0.0, 0.0, -1.0]) * gravity)
-        return solver(contacts, disturbances, load, cone_edges, columns)
+        actuation = None
+        if "jacobian" in columns:
+            actuation = Actuation(**{f.name: columns.get(f.name) for f in dataclasses.fields(Actuation)})
+        task = {"required_wrench": load, "cone_edges": cone_edges, "actuation": actuation}
+        return solver(contacts, disturbances, task, columns)
 
     spread = jax.shard_map(
         on_one_device, mesh=mesh, in_specs=(P("candidates"), P(), P()), out_specs=P("candidates"), check_vma=False

@@ -1,0 +1,97 @@
+"""From configurations of a hand to candidates that can be ranked."""
+
+from collections.abc import Callable
+from dataclasses import fields
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxgrasp.candidates import Candidates
+from jaxgrasp.contact import Actuation
+from jaxgrasp.hands import HandObject
+
+# Configurations at a time.
+TILE = 1024
+_CONTACTS = ("positions", "frames", "friction", "max_force", "active")
+_TRANSMISSION = {"transmission", "inverse", "unreached"}
+
+
+def candidates_of(
+    hand: HandObject,
+    qpos: Float[np.ndarray, "batch nq"],
+    *,
+    source: str,
+    limited: bool = True,
+    columns: dict[str, np.ndarray] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Candidates:
+    """Finds the contacts of a hand in many configurations, and what its actuators can do.
+
+    Args:
+        hand: The hand and the object.
+        qpos: Configurations.
+        source: Where they are from.
+        limited: Whether the actuators' limits count; else every contact may push with its largest force.
+        columns: What else travels along, arrays with a leading axis of N, by name.
+        progress: Called after each tile with the number of configurations done.
+
+    Returns:
+        The candidates, with the columns `qpos`, `touching` (how many contacts touch) and `penetration`, m.
+
+    Raises:
+        ValueError: A configuration has another length.
+    """
+    qpos = np.asarray(qpos, float)
+    count = len(qpos)
+    parts = []
+    for first in range(0, count, TILE):
+        # The last tile is filled up, so that one compilation serves all.
+        rows = np.arange(first, first + min(TILE, count)) % count
+        # What is the same for all is kept once.
+        stop = {name: 1 for name in _TRANSMISSION} if hand.constant_transmission else {}
+        found = _columns(hand, qpos[rows], limited)
+        parts.append({name: np.asarray(x)[: stop.get(name, count - first)] for name, x in found.items()})
+        if progress is not None:
+            progress(min(first + TILE, count))
+    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if hand.constant_transmission:
+        found |= {
+            name: np.broadcast_to(x[:1], (count, *x.shape[1:])) for name, x in found.items() if name in _TRANSMISSION
+        }
+    contacts = {name: found.pop(name) for name in _CONTACTS}
+    own = {"touching": found.pop("touching"), "penetration": found.pop("penetration"), "qpos": qpos}
+    return Candidates(
+        **contacts,
+        mass=np.full(count, hand.object_mass),
+        hand=found,
+        columns=own | (columns or {}),
+        sources=(source,),
+        source=np.zeros(count, int),
+        index=np.arange(count),
+    )
+
+
+def kept(candidates: Candidates, min_contacts: int, max_penetration: float) -> Bool[np.ndarray, " batch"]:
+    """Which candidates have contacts enough and are not too deep in the object; those not admissible are kept.
+
+    Args:
+        candidates: Of `candidates_of`.
+        min_contacts: How many contacts must touch.
+        max_penetration: How deep hand and object may be in each other, m.
+    """
+    known = np.isfinite(candidates.hand["required_wrench"]).all(-1)
+    fine = (candidates.columns["touching"] >= min_contacts) & (candidates.columns["penetration"] <= max_penetration)
+    return fine | ~known
+
+
+def _columns(hand: HandObject, qpos: np.ndarray, limited: bool) -> dict[str, jax.Array]:
+    grasps = hand.grasps(qpos)
+    columns = {name: getattr(grasps.contacts, name) for name in _CONTACTS}
+    columns |= {name: getattr(grasps, name) for name in ("touching", "penetration", "required_wrench")}
+    if limited:
+        actuation = {f.name: getattr(grasps.actuation, f.name) for f in fields(Actuation)}
+        idle, one = (hand.controls(grasps, jnp.full_like(grasps.actuator_lengths, effort)) for effort in (0, 1))
+        columns |= actuation | {"idle_controls": idle, "controls_per_effort": one - idle}
+    return {name: column for name, column in columns.items() if column is not None}
