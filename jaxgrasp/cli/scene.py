@@ -116,7 +116,7 @@ class Scene:
             CommandError: The file cannot be used, or no configuration is left.
         """
         from jaxgrasp.cli.report import counting_bar
-        from jaxgrasp.ranking import candidates_of, kept
+        from jaxgrasp.ranking.configurations import candidates_of, kept
 
         columns: dict[str, np.ndarray] = {}
         if self.qpos is None:

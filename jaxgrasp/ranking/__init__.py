@@ -1,6 +1,5 @@
 """Many candidates scored, sorted and written."""
 
-from jaxgrasp.ranking.configurations import candidates_of, kept
 from jaxgrasp.ranking.rank import Ranking, RankingInterrupted, rank
 from jaxgrasp.ranking.table import TABLE_ENDINGS, ranking_table, write_table
 
@@ -8,8 +7,6 @@ __all__ = [
     "TABLE_ENDINGS",
     "Ranking",
     "RankingInterrupted",
-    "candidates_of",
-    "kept",
     "rank",
     "ranking_table",
     "write_table",

@@ -25,6 +25,8 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.fence import each, fenced, repeat
 
 Rows = tuple[jax.Array, ...]
+# Matrices of the equality rows up to this size are factored as they are.
+_UNDIVIDED = 8
 
 
 class Blocks(NamedTuple):
@@ -134,12 +136,25 @@ def _substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[j
     return out
 
 
-def _inverse_root(matrix: jax.Array) -> jax.Array:
-    """L^-1 of a symmetric positive definite (eq, eq, *lanes); pivots clamped at eps of their diagonal."""
+def _inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array:
+    """L^-1 of a symmetric positive definite (eq, eq, *lanes).
+
+    Pivots are clamped at a floor (eq, *lanes), eps of the diagonal. Large matrices are cut in two: L^-1 is made of
+    those of a corner and of what is left of the other one, a third of the work.
+    """
     size, lanes = matrix.shape[0], matrix.shape[2:]
     index = jnp.arange(size).reshape(size, *[1] * len(lanes))
     eye = jnp.eye(size, dtype=matrix.dtype).reshape(size, size, *[1] * len(lanes))
-    floor = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix)
+    if floor is None:
+        floor = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix)
+    if size > _UNDIVIDED:
+        half = size // 2
+        first = _inverse_root(matrix[:half, :half], floor[:half])
+        across = _times_transposed(matrix[half:, :half], first)
+        last = _inverse_root(matrix[half:, half:] - _times_transposed(across, across), floor[half:])
+        corner = -_times(last, _times(across, first))
+        zero = jnp.zeros((half, size - half, *lanes), matrix.dtype)
+        return jnp.concatenate([jnp.concatenate([first, zero], 1), jnp.concatenate([corner, last], 1)])
 
     def eliminate(j: jax.Array, state: tuple) -> tuple:
         left, root = state
@@ -157,6 +172,17 @@ def _inverse_root(matrix: jax.Array) -> jax.Array:
         return subtract(left, inverse, shares), subtract(root, inverse, shares)
 
     return repeat(size, eliminate, (matrix, jnp.broadcast_to(eye, matrix.shape)))[1]
+
+
+@fenced
+def _times(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A B of matrices (r, c, *lanes) and (c, d, *lanes)."""
+    return each(lambda row: fold(jnp.add, [x * y for x, y in zip(row, b, strict=True)]), a)
+
+
+def _times_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A B' of matrices (r, c, *lanes) and (d, c, *lanes)."""
+    return _times(a, jnp.swapaxes(b, 0, 1))
 
 
 @dataclass(frozen=True)
