@@ -1,102 +1,232 @@
 """Margins that a hand can produce, against HiGHS and Clarabel with every row written out."""
 
+from dataclasses import dataclass
 
+import clarabel
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse
 from scipy.optimize import linprog
 
 import jaxgrasp as jg
 
-# The gap to which margins and efforts are certified in float64 is 1e-8 of max(1, margin / scale).
+# The gap to which margins and efforts are certified in float64 is 1e-8 of max(Lambda, margin), and Lambda is below 10.
 TOLERANCE = 2e-8
+# Derivatives of exact forces are those of a central point.
+SMOOTHED = 1e-5
 BATCH, CONTACTS, JOINTS, EDGES = 60, 4, 9, 8
-
-
-def hands(seed: int, actuators: int, redundant: bool = False) -> tuple[jg.Contacts, dict]:
-    """Random grasps of a ball by a thumb against three fingers, joints that move random contacts."""
-    rng = np.random.default_rng(seed)
-    normals = np.array([[-1.0, 0.0, 0.1], [0.8, -0.6, 0.2], [0.8, 0.6, 0.2], [0.9, 0.0, -0.7]])
-    normals = normals + 0.25 * rng.normal(size=(BATCH, CONTACTS, 3))
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    contacts = jg.Contacts.from_normals(
-        0.03 * normals, normals, friction=rng.uniform(0.4, 0.9, (BATCH, CONTACTS)), max_force=6.0
-    )
-    jacobian = 0.05 * rng.normal(size=(BATCH, CONTACTS, 3, JOINTS))
-    transmission = np.eye(JOINTS)[:, :actuators] + 0.3 * rng.normal(size=(JOINTS, actuators))
-    if redundant:
-        transmission = np.column_stack([transmission, 0.7 * transmission[:, 0]])
-    limits = rng.uniform(0.1, 0.3, (BATCH, transmission.shape[1]))
-    return contacts, {"jacobian": jacobian, "transmission": transmission, "lower": -limits, "upper": 1.2 * limits}
-
-
-def solved(contacts, hand, **given):
-    actuation = jg.Actuation.from_jacobian(**hand)
-    return jax.jit(lambda c: jg.largest_disturbance(c, PUSHES, actuation=actuation, **given))(contacts)
-
-
 PUSHES = jg.DisturbanceSet.forces(1.0)
 WRENCHES = np.concatenate([np.eye(6)[:3], -np.eye(6)[:3]])
 WEIGHT = np.array([0.1, 0.2, 0.98, 0.0, 0.001, 0.0])
 
 
-def rows_of(contacts: jg.Contacts, hand: dict, lane: int, compliance=None) -> tuple:
+@dataclass(frozen=True, kw_only=True)
+class Hand:
+    """Random grasps of a ball by a thumb against three fingers, joints that move random contacts."""
+
+    contacts: jg.Contacts
+    jacobian: np.ndarray
+    transmission: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    compliance: np.ndarray | None
+
+    @property
+    def actuation(self) -> jg.Actuation:
+        return jg.Actuation.from_jacobian(self.jacobian, self.transmission, self.lower, self.upper)
+
+    @property
+    def task(self) -> dict:
+        return {"required_wrench": WEIGHT, "compliance": self.compliance, "actuation": self.actuation}
+
+
+def make(seed: int, actuators: int, redundant: bool, compliant: bool) -> Hand:
+    rng = np.random.default_rng(seed)
+    normals = np.array([[-1.0, 0.0, 0.1], [0.8, -0.6, 0.2], [0.8, 0.6, 0.2], [0.9, 0.0, -0.7]])
+    normals = normals + 0.25 * rng.normal(size=(BATCH, CONTACTS, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    friction = rng.uniform(0.4, 0.9, (BATCH, CONTACTS))
+    transmission = np.eye(JOINTS)[:, :actuators] + 0.3 * rng.normal(size=(JOINTS, actuators))
+    if redundant:
+        transmission = np.column_stack([transmission, 0.7 * transmission[:, 0]])
+    limits = rng.uniform(0.1, 0.3, (BATCH, transmission.shape[1]))
+    M = rng.normal(size=(BATCH, 3 * CONTACTS, 3 * CONTACTS))
+    return Hand(
+        contacts=jg.Contacts.from_normals(0.03 * normals, normals, friction=friction, max_force=6.0),
+        jacobian=0.05 * rng.normal(size=(BATCH, CONTACTS, 3, JOINTS)),
+        transmission=transmission,
+        lower=-limits,
+        upper=1.2 * limits,
+        compliance=np.eye(3 * CONTACTS) + 0.1 * M @ M.swapaxes(-1, -2) if compliant else None,
+    )
+
+
+def rows_of(hand: Hand, lane: int) -> tuple:
     """(21) of one grasp over (f, u, lambda): A x <= h, B x = c."""
-    G = np.asarray(jg.grasp_map(contacts))[lane]
-    J = hand["jacobian"][lane].reshape(3 * CONTACTS, JOINTS)
-    B, count = hand["transmission"], hand["transmission"].shape[1]
+    G = np.asarray(jg.grasp_map(hand.contacts))[lane]
+    J = hand.jacobian[lane].reshape(3 * CONTACTS, JOINTS)
+    B, count = hand.transmission, hand.transmission.shape[1]
     left, values, _ = np.linalg.svd(B)
     N = left[:, np.sum(values > 1e-9) :]
-    stacked = np.vstack([G, N.T @ J.T])
-    root = np.linalg.cholesky(np.eye(3 * CONTACTS) if compliance is None else compliance[lane])
-    star = np.linalg.solve(root.T, np.linalg.pinv(np.linalg.solve(root, stacked.T).T, 1e-9))[:, :6]
+    root = np.linalg.cholesky(np.eye(3 * CONTACTS) if hand.compliance is None else hand.compliance[lane])
+    whitened = np.linalg.solve(root, np.vstack([G, N.T @ J.T]).T).T
+    star = np.linalg.solve(root.T, np.linalg.pinv(whitened, 1e-9))[:, :6]
     force = -WRENCHES @ star.T
     effort = force @ J @ np.linalg.pinv(B).T
-    k = np.arange(EDGES)
-    angle = (2 * k + 1) * np.pi / EDGES
-    blocks = [
-        np.stack([np.cos(angle), np.sin(angle), np.full(EDGES, mu * np.cos(np.pi / EDGES))], -1)
-        for mu in np.asarray(contacts.friction)[lane]
-    ]
-    C, E = scipy.linalg.block_diag(*blocks), np.kron(np.eye(CONTACTS), [0.0, 0.0, 1.0])
+    angle = (2 * np.arange(EDGES) + 1) * np.pi / EDGES
+    C = scipy.linalg.block_diag(
+        *[
+            np.stack([np.cos(angle), np.sin(angle), np.full(EDGES, mu * np.cos(np.pi / EDGES))], -1)
+            for mu in np.asarray(hand.contacts.friction)[lane]
+        ]
+    )
+    E = np.kron(np.eye(CONTACTS), [0.0, 0.0, 1.0])
     worst = lambda change: np.maximum(change.max(0), 0)  # noqa: E731
     A = np.zeros((len(C) + CONTACTS + 2 * count, 3 * CONTACTS + count + 1))
     A[: len(C), : 3 * CONTACTS], A[len(C) : len(C) + CONTACTS, : 3 * CONTACTS] = C, -E
     A[-2 * count : -count, 3 * CONTACTS : -1], A[-count:, 3 * CONTACTS : -1] = np.eye(count), -np.eye(count)
     A[:, -1] = np.concatenate([worst(force @ C.T), worst(-force @ E.T), worst(effort), worst(-effort)])
     h = np.concatenate(
-        [np.zeros(len(C)), np.asarray(contacts.max_force)[lane], hand["upper"][lane], -hand["lower"][lane]]
+        [np.zeros(len(C)), np.asarray(hand.contacts.max_force)[lane], hand.upper[lane], -hand.lower[lane]]
     )
     equal = np.zeros((6 + JOINTS, A.shape[1]))
     equal[:6, : 3 * CONTACTS], equal[6:, : 3 * CONTACTS], equal[6:, 3 * CONTACTS : -1] = G, J.T, -B
-    return A, h, equal, np.concatenate([WEIGHT, np.zeros(JOINTS)])
-
-
-def by_highs(A, h, equal, c) -> float:
-    cost = np.append(np.zeros(A.shape[1] - 1), -1.0)
     # Torques and moments are small numbers.
     size = np.abs(equal).max(1)
-    out = linprog(
-        cost, A, h, equal / size[:, None], c / size, (None, None), "highs",
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )  # fmt: skip
+    return A, h, equal / size[:, None], np.concatenate([WEIGHT, np.zeros(JOINTS)]) / size
+
+
+def largest(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray) -> float:
+    cost = np.append(np.zeros(A.shape[1] - 1), -1.0)
+    options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    out = linprog(cost, A, h, equal, c, (None, None), "highs", options=options)
     return -out.fun if out.status == 0 else np.nan
 
 
-@pytest.mark.parametrize("actuators, redundant", [(9, False), (7, False), (7, True)])
-@pytest.mark.parametrize("compliant", [False, True])
-def test_margin_against_highs(actuators, redundant, compliant):
-    contacts, hand = hands(3, actuators, redundant)
-    compliance = None
-    if compliant:
-        M = np.random.default_rng(1).normal(size=(BATCH, 3 * CONTACTS, 3 * CONTACTS))
-        compliance = np.eye(3 * CONTACTS) + 0.1 * M @ M.swapaxes(-1, -2)
-    found = solved(contacts, hand, required_wrench=WEIGHT, compliance=compliance)
-    truth = np.array([by_highs(*rows_of(contacts, hand, lane, compliance)) for lane in range(BATCH)])
-    print(np.c_[truth, found.margin, found.status, found.iterations][:10])
+def least(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray, margin: float) -> float:
+    """The effort of (22) by Clarabel."""
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    rows = scipy.sparse.csc_matrix(np.vstack([equal, A])[:, :-1])
+    cones = [clarabel.ZeroConeT(len(c)), clarabel.NonnegativeConeT(len(h))]
+    P = scipy.sparse.diags((np.arange(rows.shape[1]) < 3 * CONTACTS).astype(float), format="csc")
+    right = np.concatenate([c, h - A[:, -1] * margin])
+    return clarabel.DefaultSolver(P, np.zeros(rows.shape[1]), rows, right, cones, settings).solve().obj_val
+
+
+HANDS = {
+    "an actuator a joint": make(3, JOINTS, redundant=False, compliant=False),
+    "two joint directions unreached": make(3, JOINTS - 2, redundant=False, compliant=True),
+    "two unreached, one reached twice": make(3, JOINTS - 2, redundant=True, compliant=False),
+}
+
+
+@pytest.fixture(scope="module", params=HANDS, ids=str)
+def solved(request):
+    hand = HANDS[request.param]
+    found = jg.largest_disturbance(hand.contacts, PUSHES, **hand.task)
+    return hand, found, np.array([largest(*rows_of(hand, lane)) for lane in range(BATCH)])
+
+
+def test_margins_are_those_of_highs(solved):
+    hand, found, truth = solved
     assert np.isfinite(truth).all()
     assert np.all(np.abs(found.margin - truth) <= TOLERANCE * np.maximum(10, np.abs(truth)))
     assert np.all(np.asarray(found.status) == np.where(truth < 0, jg.Status.INFEASIBLE, jg.Status.SOLVED))
-    torque = jg.Actuation.from_jacobian(**hand).joint_torques(found.forces)
-    np.testing.assert_allclose(torque, found.actuator_efforts @ hand["transmission"].T, atol=1e-9)
+
+
+def test_efforts_make_the_forces_and_stay_within_limits(solved):
+    hand, found, _ = solved
+    torque = hand.actuation.joint_torques(found.forces)
+    np.testing.assert_allclose(torque, found.actuator_efforts @ hand.transmission.T, atol=1e-9)
+    holds = np.asarray(found.margin) >= 0
+    assert np.all((found.actuator_efforts <= hand.upper + 1e-9)[holds])
+    assert np.all((found.actuator_efforts >= hand.lower - 1e-9)[holds])
+
+
+def test_least_effort_is_that_of_clarabel():
+    hand = HANDS["an actuator a joint"]
+    margin = 0.75 * np.array([largest(*rows_of(hand, lane)) for lane in range(BATCH)])
+    found = jg.least_effort(hand.contacts, PUSHES, np.maximum(margin, 0), **hand.task)
+    holds = margin > 0
+    assert holds.sum() > BATCH / 2
+    assert np.all(np.asarray(found.status)[holds] == jg.Status.SOLVED)
+    truth = np.array([least(*rows_of(hand, lane), margin[lane]) for lane in np.flatnonzero(holds)])
+    np.testing.assert_allclose(found.effort[holds], truth, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def moved():
+    """What depends on the data along a line through them: data at t, and the margin there."""
+    hand, rng = HANDS["two joint directions unreached"], np.random.default_rng(0)
+    start = {
+        "positions": hand.contacts.positions,
+        "jacobian": jnp.asarray(hand.jacobian),
+        "transmission": jnp.asarray(hand.transmission),
+        "upper": jnp.asarray(hand.upper),
+        "weight": jnp.asarray(WEIGHT),
+    }
+    sizes = {"positions": 1e-3, "jacobian": 1e-2, "transmission": 0.1, "upper": 0.1, "weight": 0.1}
+    along = {name: sizes[name] * rng.normal(size=x.shape) for name, x in start.items()}
+
+    def task(t):
+        at = {name: x + t * along[name] for name, x in start.items()}
+        normals = hand.contacts.frames[..., 2]
+        contacts = jg.Contacts.from_normals(at["positions"], normals, friction=hand.contacts.friction, max_force=6.0)
+        actuation = jg.Actuation.from_jacobian(at["jacobian"], at["transmission"], hand.lower, at["upper"])
+        return contacts, {"required_wrench": at["weight"], "actuation": actuation}
+
+    return task
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("program", ["largest_disturbance", "least_effort"])
+def test_derivatives_are_central_differences(moved, program):
+    def answer(t):
+        contacts, task = moved(t)
+        if program == "largest_disturbance":
+            return jg.largest_disturbance(contacts, PUSHES, **task).margin
+        found = jg.least_effort(contacts, PUSHES, 0.02, **task)
+        return jnp.concatenate([found.forces.reshape(BATCH, -1), 10 * found.actuator_efforts], 1)
+
+    step, known = 1e-5, jax.jit(answer)
+    numeric = np.asarray((known(step) - known(-step)) / (2 * step)).reshape(BATCH, -1)
+    forward = np.asarray(jax.jit(lambda t: jax.jvp(answer, (t,), (1.0,))[1])(0.0)).reshape(BATCH, -1)
+    answered = np.isfinite(numeric).all(-1) & np.isfinite(np.asarray(known(0.0)).reshape(BATCH, -1)).all(-1)
+    off = np.abs(forward - numeric).max(-1)[answered] / np.maximum(1, np.abs(numeric).max(-1)[answered])
+    assert answered.sum() >= BATCH / 3
+    # Where a row becomes active within the step there is a kink.
+    assert np.quantile(off, 0.9) <= SMOOTHED
+    weights = np.random.default_rng(1).normal(size=forward.shape)
+    total = lambda t: jnp.sum(jnp.where(answered[:, None], weights * answer(t).reshape(BATCH, -1), 0))  # noqa: E731
+    backward = jax.jit(jax.grad(total))(0.0)
+    np.testing.assert_allclose(backward, np.sum((weights * forward)[answered]), rtol=1e-8)
+
+
+def test_bad_limits_are_one_grasps_own_affair():
+    hand = HANDS["an actuator a joint"]
+    upper, jacobian = hand.upper.copy(), hand.jacobian.copy()
+    upper[3, 2], upper[5, 1], jacobian[7, 0, 0, 0] = np.nan, hand.lower[5, 1] - 0.1, np.inf
+    bad = jg.Actuation.from_jacobian(jacobian, hand.transmission, hand.lower, upper)
+    good = jg.largest_disturbance(hand.contacts, PUSHES, **hand.task)
+    found = jg.largest_disturbance(hand.contacts, PUSHES, required_wrench=WEIGHT, actuation=bad)
+    wrong = np.isin(np.arange(BATCH), (3, 5, 7))
+    assert np.all((np.asarray(found.status) == jg.Status.INVALID_INPUT) == wrong)
+    np.testing.assert_array_equal(found.margin[~wrong], good.margin[~wrong])
+
+
+def test_shapes_that_do_not_fit_are_named():
+    hand = HANDS["an actuator a joint"]
+    with pytest.raises(ValueError, match=r"transmission: got shape \(8, 9\), wanted \(\*batch, 9, n_u\)"):
+        jg.Actuation.from_jacobian(hand.jacobian, hand.transmission[:-1], hand.lower, hand.upper)
+    with pytest.raises(ValueError, match=r"upper: got shape \(60, 8\)"):
+        jg.Actuation.from_jacobian(hand.jacobian, hand.transmission, hand.lower, hand.upper[:, :-1])
+    short = jg.Actuation.from_jacobian(hand.jacobian[:, :3], hand.transmission, hand.lower, hand.upper)
+    with pytest.raises(ValueError, match=r"actuation: got a jacobian .* one for each of the 4 contacts"):
+        jg.largest_disturbance(hand.contacts, PUSHES, actuation=short)
+    with pytest.raises(ValueError, match="wanted jaxgrasp.Actuation"):
+        jg.largest_disturbance(hand.contacts, PUSHES, actuation=hand.jacobian)
