@@ -14,7 +14,7 @@ from jax import Array, lax
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.geom import Body
-from jaxgrasp.geometry.pairs.supports import bulge, corner, is_smooth
+from jaxgrasp.geometry.pairs.supports import bulge, corner
 from jaxgrasp.geometry.pairs.vectors import (
     Vector,
     axis,
@@ -32,9 +32,11 @@ from jaxgrasp.geometry.pairs.vectors import (
 _CLIMBS = 12
 _ROUNDS = 48
 # A convex set's nearest point is found to this, relative to its squared distance.
-_GAP = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
+_GAP = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-5}
+# The climb ends where it gains less than this share of the separation.
+_GAIN = 1e-3
 # Geoms inside each other are moved apart by this share of (their depth + 1 cm).
-_SLACK = {"smooth": 1e-2, "sharp": 1e-2}
+_SLACK = 1e-2
 
 
 class Corners(NamedTuple):
@@ -57,7 +59,6 @@ Support = Callable[[Vector], Corners]
 
 def search(kind_a: str, kind_b: str, a: Body, b: Body) -> tuple[Vector, Simplex]:
     """The direction from a to b along which they are farthest apart, and the corners that are nearest."""
-    slack = _SLACK["smooth" if is_smooth(kind_a) or is_smooth(kind_b) else "sharp"]
     start = b.position - a.position
     length = norm(start)
     d = choose(length > 0, unit(start), axis(2, length))
@@ -69,13 +70,13 @@ def search(kind_a: str, kind_b: str, a: Body, b: Body) -> tuple[Vector, Simplex]
         count, d, simplex, done = state
         here = dot(d, support(d, zeros(length)).point)
         out = jnp.maximum(-here, 0)
-        shift = d * jnp.where(here > 0, 0, out + slack * (out + 0.01))
+        shift = d * jnp.where(here > 0, 0, out + _SLACK * (out + 0.01))
         found = _nearest(lambda d: support(d, shift), d)
         toward = unit(_combined(found))
         toward = choose(dot(toward, toward) > 0.5, toward, d)
         after = dot(toward, support(toward, zeros(length)).point)
         better = ~done & (after >= here)
-        done = done | (here > 0) | (after - here <= 1e-9 * (jnp.abs(here) + 1e-6))
+        done = done | (here > 0) | (after - here <= _GAIN * (jnp.abs(here) + 1e-6))
         return count + 1, choose(better, toward, d), choose(better | (count == 0), found, simplex), done
 
     zero = zeros(length)
