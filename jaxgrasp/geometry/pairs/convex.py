@@ -30,7 +30,7 @@ from jaxgrasp.geometry.pairs.vectors import (
     dot,
     each,
     least_along,
-    norm,
+    pick,
     root,
     rotate,
     unit,
@@ -80,11 +80,13 @@ def _solve(kind_a: str, kind_b: str, a: Body, b: Body, direction: Vector, simple
     fixed = dot(second, second) > 0
     normal = unit(cross(first, second))
     flat = choose(dot(normal, direction) < 0, -normal, normal)
-    d = direction
     if is_smooth(kind_a) or is_smooth(kind_b):
         held = jax.tree.map(lax.stop_gradient, (between, first, sides))
-        d = lax.fori_loop(0, _STEPS, lambda _, d: _newton(d, *held), d)
-    d = choose(fixed, flat, fenced(_newton)(d, between, first, sides))
+        d = lax.fori_loop(0, _STEPS, lambda _, d: _newton(d, *held), direction)
+        free = fenced(_newton)(d, between, first, sides)
+    else:
+        free = _straight(between, first, direction)
+    d = choose(fixed, flat, free)
     apart = between - _bulge(sides[0], d) - _bulge(sides[1], d)
     separation = dot(d, apart)
     # a's point and b's are corner + edges + ellipsoid's point; their difference is separation times d.
@@ -96,14 +98,16 @@ def _solve(kind_a: str, kind_b: str, a: Body, b: Body, direction: Vector, simple
 
 def _side(kind: str, body: Body, corners: list[Vector], weights: tuple[Array, ...], direction: Vector) -> _Side:
     """`corners` are local, `weights` what they weigh in the nearest point."""
-    heavy = (weights[0] >= weights[1]) & (weights[0] >= weights[2])
-    main = choose(heavy, corners[0], choose(weights[1] >= weights[2], corners[1], corners[2]))
     limit = _TOLERANCE[direction.x.dtype]
     zero = zeros(direction.x)
-    edges = [
-        rotate(body.rotation, choose(weight > limit, corner - main, zero))
-        for corner, weight in zip(corners, weights, strict=True)
-    ]
+    main, edges = corners[0], []
+    if kind not in ("sphere", "ellipsoid"):
+        slots = list(zip(corners, weights, strict=True))
+        first = (weights[0] >= weights[1]) & (weights[0] >= weights[2])
+        last = ~first & (weights[2] > weights[1])
+        main = choose(first, corners[0], choose(last, corners[2], corners[1]))
+        for corner, weight in (choose(first, slots[1], slots[0]), choose(last, slots[1], slots[2])):
+            edges.append(rotate(body.rotation, choose(weight > limit, corner - main, zero)))
     axes = roundness(kind, body)
     if kind == "cylinder":
         # On a cap every direction within it is an edge.
@@ -116,17 +120,16 @@ def _side(kind: str, body: Body, corners: list[Vector], weights: tuple[Array, ..
 
 def _independent(sides: _Sides) -> tuple[Vector, Vector, tuple[Array, Array]]:
     """Two edges that the direction is normal to, zero where there are none, and whether they are a's."""
-    edges = [(edge, own) for side, own in zip(sides, (True, False), strict=True) for edge in side.edges]
+    edges, like = [*sides[0].edges, *sides[1].edges], sides[0].corner.x
 
     def best(score: Callable[[Vector], Array], least: float) -> tuple[Vector, Array]:
-        chosen = zeros(edges[0][0].x)
-        top, whose = jnp.full_like(chosen.x, least), jnp.zeros(chosen.x.shape, bool)
-        for edge, own in edges:
+        top, number = jnp.full_like(like, least), jnp.zeros(like.shape, jnp.int32)
+        for i, edge in enumerate(edges, 1):
             value = lax.stop_gradient(score(edge))
-            top, chosen, whose = choose(
-                value > top, (value, edge, jnp.full_like(whose, own)), (top, chosen, whose)
-            )
-        return chosen, whose
+            number = jnp.where(value > top, i, number)
+            top = jnp.maximum(value, top)
+        chosen = pick([zeros(like), *edges], number)
+        return chosen, (number > 0) & (number <= len(sides[0].edges))
 
     def sine(edge: Vector) -> Array:
         across = cross(along, edge)
@@ -144,6 +147,13 @@ def _bulge(side: _Side, d: Vector) -> Vector:
         return zeros(d.x)
     spread = side.spread(d)
     return spread * safe_divide(jnp.ones_like(d.x), root(dot(d, spread)))
+
+
+def _straight(between: Vector, edge: Vector, direction: Vector) -> Vector:
+    """Between two corners, or a corner and an edge."""
+    edge = unit(edge)
+    d = unit(between - edge * dot(edge, between))
+    return choose(dot(d, direction) < 0, -d, d)
 
 
 def _newton(d: Vector, between: Vector, edge: Vector, sides: _Sides) -> Vector:

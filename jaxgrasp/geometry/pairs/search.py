@@ -77,18 +77,19 @@ def search(kind_a: str, kind_b: str, a: Body, b: Body) -> tuple[Vector, Simplex]
     length = norm(start)
     zero = zeros(length)
 
-    def support(d: Vector, shift: Vector) -> Corners:
-        return _support(kind_a, kind_b, a, b, d, shift)
+    def support(d: Vector) -> Corners:
+        return _support(kind_a, kind_b, a, b, d)
 
     def climb(state: _State) -> _State:
         d = state.d
-        here = dot(d, support(d, zero).point)
+        first = support(d)
+        here = dot(d, first.point)
         out = jnp.maximum(-here, 0)
         shift = d * jnp.where(here > 0, 0, out + _SLACK * (out + 0.01))
-        found = _nearest(lambda d: support(d, shift), d)
+        found = _nearest(support, first, shift)
         toward = unit(_combined(found))
         toward = choose(dot(toward, toward) > 0.5, toward, d)
-        after = dot(toward, support(toward, zero).point)
+        after = dot(toward, support(toward).point)
         better = ~state.done & (after > state.best[0])
         best = choose(better, (after, toward, found), state.best)
         on_top = after - here <= _GAIN * (jnp.abs(here) + 1e-6)
@@ -112,13 +113,13 @@ def _tilted(d: Vector, attempt: Array) -> Vector:
     return unit(pick([d, *(d + one * x + two * y for x, y in _TILTS)], attempt))
 
 
-def _support(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector, shift: Vector) -> Corners:
-    """The least of b + shift - a along d."""
+def _support(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector) -> Corners:
+    """The least of b - a along d."""
     toward_a, toward_b = unrotate(a.rotation, d), unrotate(b.rotation, -d)
     corner_a, corner_b = corner(kind_a, a, toward_a), corner(kind_b, b, toward_b)
     point_a = rotate(a.rotation, corner_a + bulge(kind_a, a, toward_a))
     point_b = rotate(b.rotation, corner_b + bulge(kind_b, b, toward_b))
-    return Corners(b.position - a.position + shift + point_b - point_a, corner_a, corner_b)
+    return Corners(b.position - a.position + point_b - point_a, corner_a, corner_b)
 
 
 def _combined(simplex: Simplex) -> Vector:
@@ -126,13 +127,13 @@ def _combined(simplex: Simplex) -> Vector:
     return one + two + three
 
 
-def _nearest(support: Support, d: Vector) -> Simplex:
-    """The simplex that holds the nearest point of a convex set, which must not hold the origin."""
-    first = support(d)
-    zero = zeros(d.x)
+def _nearest(support: Support, first: Corners, shift: Vector) -> Simplex:
+    """The simplex that holds the nearest of all points b - a + shift, which must not hold the origin."""
+    zero = zeros(shift.x)
     empty = Corners(zero, zero, zero)
-    start = Simplex((first, empty, empty), (jnp.ones_like(d.x), zero.x, zero.x))
-    dtype = d.x.dtype
+    moved = first._replace(point=first.point + shift)
+    start = Simplex((moved, empty, empty), (jnp.ones_like(shift.x), zero.x, zero.x))
+    dtype = shift.x.dtype
     rounding = 8 * float(jnp.finfo(dtype).eps)
 
     def add(state: tuple[Array, Simplex, Array]) -> tuple[Array, Simplex, Array]:
@@ -140,13 +141,14 @@ def _nearest(support: Support, d: Vector) -> Simplex:
         nearest = _combined(simplex)
         squared = dot(nearest, nearest)
         new = support(unit(nearest))
+        new = new._replace(point=new.point + shift)
         gap = squared - dot(nearest, new.point)
         done = done | (gap <= _GAP[dtype] * squared + rounding * norm(nearest) * norm(new.point))
         reduced, value = _reduced(simplex, new)
         closer = value < squared * (1 - rounding)
         return count + 1, choose(done | ~closer, simplex, reduced), done | ~closer
 
-    state = (jnp.zeros((), jnp.int32), start, jnp.zeros(d.x.shape, bool))
+    state = (jnp.zeros((), jnp.int32), start, jnp.zeros(shift.x.shape, bool))
     return lax.while_loop(lambda state: (state[0] < _ROUNDS) & ~jnp.all(state[2]), add, state)[1]
 
 
