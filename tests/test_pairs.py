@@ -1,17 +1,21 @@
 """Contact geometry of pairs of geoms against C MuJoCo, and its derivatives against central differences.
 
-Every pair of kinds meets in 1,000 configurations: five pairs of sizes from 1 to 4 cm (the mesh is a hull of 40 corners on
-an ellipsoid of 1.5 to 3 cm), random orientations, b placed along a random direction so that the signed distance is
+Every pair of kinds meets in 1,000 configurations: five pairs of sizes from 1 to 4 cm (the mesh is a hull of 40 corners
+on an ellipsoid of 1.5 to 3 cm), random orientations, b placed along a random direction so that the signed distance is
 uniform from -4 mm to 2 cm. C reports the contacts of each once as is and once with margins that take in those apart.
 
-Where ours differ from C's, all with C's extra contacts of curved and mesh pairs (`multiccd`) switched off:
+Where ours differ from C's; C's extra contacts of curved and mesh pairs (`multiccd`, on unless switched off: a second
+to fourth point in a tenth to a third of the touching capsule-mesh, box-mesh, mesh-mesh and cylinder-box pairs) are
+switched off here and not among ours.
 
-| pair | what differs | why | how often |
-|---|---|---|---|
-| with ellipsoid, cylinder or mesh | C's normals are off by up to 2e-5 | its iteration ends where the distance no longer changes | 1 in 50 |
-| box-box, apart | C's contact between edges nearer than the boxes are | it measures along the axis between the edges' lines although an edge ends before they cross; ours is the nearest point | 1 in 10 of those apart |
-| box-box, inside | at most 5 % deeper than the distance | as C's: a face within 8 degrees is taken for the edges | 1 in 100 |
-| mesh or cylinder, inside | another local maximum of the separation | ours climbs from five directions | 1 in 1000 |
+- Curved pairs: C's normals are off by up to 2e-5 in 1 of 20 to 50, since its iteration ends where the distance no
+  longer changes. Ours are those along which the geoms are farther apart, which the test checks.
+- Boxes apart: C's contact between two edges may be nearer than the boxes are, in 1 of 30 contacts, since it measures
+  between the edges' lines although an edge ends before they cross. Ours is the nearest point.
+- Boxes inside each other: up to 5 % deeper than the distance in 1 of 100, in C's contacts as in ours: the face within
+  8 degrees of the edges' axis takes its place.
+- Meshes and cylinders inside each other: another local maximum of the separation in 1 of 1,000 (of those inside), by
+  up to 0.1 mm: ours climbs from five directions.
 """
 
 import itertools
@@ -52,9 +56,7 @@ def geom_xml(kind: str, size: np.ndarray, margin: float) -> str:
 
 def model_of(kinds: tuple[str, str], sizes: np.ndarray, margin: float = 0.0) -> mujoco.MjModel:
     corners = " ".join(repr(float(x)) for x in points_on_an_ellipsoid().ravel())
-    bodies = "".join(
-        f"<body><freejoint/>{geom_xml(k, s, margin)}</body>" for k, s in zip(kinds, sizes, strict=True)
-    )
+    bodies = "".join(f"<body><freejoint/>{geom_xml(k, s, margin)}</body>" for k, s in zip(kinds, sizes, strict=True))
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><asset><mesh name="hull" vertex="{corners}"/></asset>'
         '<option ccd_tolerance="1e-16" ccd_iterations="500"><flag multiccd="disable"/></option>'
@@ -111,7 +113,9 @@ class Meeting:
         position, rotation, size = (np.stack(part, -1) for part in zip(*places, strict=True))
         hull = hull_of(model) if "mesh" in kinds else None
         self.geoms = [
-            Geom(jnp.asarray(position[i]), jnp.asarray(rotation[i]), jnp.asarray(size[i]), hull if k == "mesh" else None)
+            Geom(
+                jnp.asarray(position[i]), jnp.asarray(rotation[i]), jnp.asarray(size[i]), hull if k == "mesh" else None
+            )
             for i, k in enumerate(kinds)
         ]
 
@@ -141,8 +145,17 @@ def run(kinds: tuple[str, str], geoms: list[Geom]):
 
 
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
-# Those that hands hardly meet with.
-RARE = {("ellipsoid", "ellipsoid"), ("ellipsoid", "cylinder"), ("cylinder", "cylinder"), ("ellipsoid", "mesh")}
+# Same function as others that stay, and five to ten seconds of compilation each.
+RARE = {
+    ("ellipsoid", "ellipsoid"),
+    ("ellipsoid", "cylinder"),
+    ("cylinder", "cylinder"),
+    ("ellipsoid", "mesh"),
+    ("capsule", "ellipsoid"),
+    ("capsule", "cylinder"),
+    ("capsule", "mesh"),
+    ("cylinder", "mesh"),
+}
 
 
 @pytest.mark.parametrize(
@@ -158,15 +171,21 @@ def test_what_c_reports(kinds):
     searched = bool({"cylinder", "mesh"} & set(kinds)) and kinds != ("sphere", "cylinder")
     missing, extra, edges, total = 0, 0, 0, 0
     for lane, (touching, near) in enumerate(zip(meeting.touching, meeting.near, strict=True)):
-        ours = [(found.position[k, :, lane], found.normal[k, :, lane], found.distance[k, lane]) for k in range(len(here))]
+        ours = [
+            (found.position[k, :, lane], found.normal[k, :, lane], found.distance[k, lane]) for k in range(len(here))
+        ]
         used = set()
         for position, normal, distance in touching + near:
             total += 1
-            if kinds == ("box", "box") and 0 < distance < meeting.distance[lane] - BAR:
+            if kinds == ("box", "box") and 0 < distance < meeting.distance[lane] - 1e-9:
                 edges += 1
                 continue
             off = [
-                max(abs(p - position).max(), abs(d - distance), abs(n - normal).max() * (BAR / C_NORMAL if curved else 1))
+                max(
+                    abs(p - position).max(),
+                    abs(d - distance),
+                    abs(n - normal).max() * (BAR / C_NORMAL if curved else 1),
+                )
                 for p, n, d in ours
             ]
             best = int(np.argmin(off))
@@ -209,7 +228,8 @@ def test_parallel_capsules():
         for position, normal, distance in contacts:
             off = abs(found.position[..., 0] - position).max(1) + abs(found.normal[..., 0] - normal).max(1)
             assert (off + abs(found.distance[:, 0] - distance)).min() < BAR
-        assert (found.distance < 0).sum() == len(contacts)
+        # Where none lies beside the other, C reports the same point twice.
+        assert (found.distance < 0).sum() == len({round(float(p[2]), 9) for p, _, _ in contacts})
 
 
 def moved(geom: Geom, motion: jax.Array) -> Geom:
@@ -229,11 +249,11 @@ def moved(geom: Geom, motion: jax.Array) -> Geom:
         ("sphere", "cylinder"),
         ("capsule", "capsule"),
         ("capsule", "box"),
-        ("box", "box"),
-        ("sphere", "mesh"),
+        pytest.param(("box", "box"), marks=pytest.mark.thorough),
+        pytest.param(("sphere", "mesh"), marks=pytest.mark.thorough),
         ("box", "mesh"),
         ("cylinder", "box"),
-        ("capsule", "ellipsoid"),
+        pytest.param(("capsule", "ellipsoid"), marks=pytest.mark.thorough),
     ],
     ids="-".join,
 )

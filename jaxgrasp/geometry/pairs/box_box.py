@@ -1,9 +1,10 @@
 """Two boxes: what the face of one cuts out of the other's, or where two edges cross.
 
 The rules are MuJoCo's. Of the fifteen axes that may separate boxes, the six normals of faces and the nine products of
-edges, the one with the largest separation counts. Where it is a face's, the face of the other box that looks at it most is
-clipped to that face's outline, and every corner of what is left is a point. Where it is a product of edges, the point is
-between these edges. Boxes that are apart get one point more: the nearest one, where that is none of these.
+edges, the one with the largest separation counts. Where it is a face's, the face of the other box that looks at it
+most is clipped to that face's outline, and every corner of what is left is a point. Where it is a product of edges,
+the point is between these edges. Boxes that are apart get one point more: the nearest one, where that is none of
+these.
 """
 
 import jax.numpy as jnp
@@ -34,7 +35,7 @@ _BIAS = 1e-6
 _PARALLEL = 1e-16
 # An edges' axis this near to the best face's (cosine) gives way to it unless it separates better by this share.
 _SAME, _WORTH = 0.99, 0.05
-# Boxes are apart where they are so by more than this; the nearest point is another where it is nearer by more than this.
+# Boxes are apart where they are so by more than this, m; the nearest point is another where it is nearer by it.
 _APART = 1e-9
 
 _nearest = convex("box", "box")

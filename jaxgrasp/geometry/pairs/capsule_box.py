@@ -1,7 +1,7 @@
 """A capsule and a box: the nearest point, and a second one where the capsule lies along the box.
 
-The rules are MuJoCo's. The nearest point of the axis to the box is one of its ends above a face, or the nearest point to
-one of the twelve edges. From there the axis is followed to where it still lies above the box, and the sphere there
+The rules are MuJoCo's. The nearest point of the axis to the box is one of its ends above a face, or the nearest point
+to one of the twelve edges. From there the axis is followed to where it still lies above the box, and the sphere there
 is the second point.
 """
 

@@ -1,13 +1,13 @@
 """Any two convex geoms: the direction that separates them most, and the two points that are nearest along it.
 
-Every geom is a polyhedron (a point, a segment, a box, a hull) plus an ellipsoid, possibly flat (of ellipsoids, and a disc
-of cylinders), plus a ball. For a unit direction d the separation is
+Every geom is a polyhedron (a point, a segment, a box, a hull) plus an ellipsoid (a disc for cylinders), plus a ball.
+For a unit direction d the separation is
 
     s(d) = min over b of d.b - max over a of d.a,
 
-and the signed distance is its maximum over d. The search finds which corners of the polyhedra take part and about which
-d. Then d and the points follow from those corners: in closed form for polyhedra, by Newton's method where there is an
-ellipsoid, with derivatives of the last step alone, which are those of the solution.
+and the signed distance is its maximum over d. The search finds which corners of the polyhedra take part and about
+which d. Then d and the points follow from those corners: in closed form for polyhedra, by Newton's method where there
+is an ellipsoid, with derivatives of the last step alone, which are those of the solution.
 """
 
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def convex(kind_a: str, kind_b: str) -> Callable[[Body, Body], list[Point]]:
 
 
 class _Side(NamedTuple):
-    """What of a geom takes part: a corner, edges from it, and the ellipsoid with matrix rotation diag(axes^2) rotation'."""
+    """What of a geom takes part: a corner, edges from it, and the ellipsoid of the given axes."""
 
     corner: Vector  # common frame
     edges: list[Vector]  # zero where there is none

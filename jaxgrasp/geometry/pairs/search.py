@@ -167,13 +167,17 @@ def _reduced(simplex: Simplex, new: Corners) -> tuple[Simplex, Array]:
         shares = [zero, zero, zero]
         shares[i], shares[(i + 1) % 3] = share, 1 - share
         better = value < best
-        best, weights, place = choose(better, (value, tuple(shares), jnp.full_like(place, (i + 1) % 3)), (best, weights, place))
+        best, weights, place = choose(
+            better, (value, tuple(shares), jnp.full_like(place, (i + 1) % 3)), (best, weights, place)
+        )
     for i, j, slot in _FACES:
         share_i, share_j, value = fenced(_face_foot)(old[i] - point, old[j] - point, point, present[i] & present[j])
         shares = [zero, zero, zero]
         shares[i], shares[j], shares[slot] = share_i, share_j, 1 - share_i - share_j
         better = value < best
-        best, weights, place = choose(better, (value, tuple(shares), jnp.full_like(place, slot)), (best, weights, place))
+        best, weights, place = choose(
+            better, (value, tuple(shares), jnp.full_like(place, slot)), (best, weights, place)
+        )
     corners = tuple(choose(place == i, new, corner) for i, corner in enumerate(simplex.corners))
     return Simplex((corners[0], corners[1], corners[2]), weights), best
 

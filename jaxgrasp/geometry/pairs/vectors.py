@@ -33,18 +33,23 @@ class Vector:
         return jnp.stack([self.x, self.y, self.z])
 
     def __getitem__(self, index: int) -> Array:
+        """A component."""
         return (self.x, self.y, self.z)[index]
 
     def __add__(self, other: "Vector") -> "Vector":
+        """Sum."""
         return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
 
     def __sub__(self, other: "Vector") -> "Vector":
+        """Difference."""
         return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
 
     def __neg__(self) -> "Vector":
+        """The opposite."""
         return Vector(-self.x, -self.y, -self.z)
 
     def __mul__(self, scale: ArrayLike) -> "Vector":
+        """A number, or one a lane, times the vector."""
         return Vector(self.x * scale, self.y * scale, self.z * scale)
 
     __rmul__ = __mul__
