@@ -12,7 +12,7 @@ from jax import Array, lax
 
 from jaxgrasp.arrays import fold, safe_divide
 from jaxgrasp.fence import fenced
-from jaxgrasp.geometry.pairs.convex import convex
+from jaxgrasp.geometry.pairs.convex import nearest
 from jaxgrasp.geometry.pairs.geom import Body, Point
 from jaxgrasp.geometry.pairs.vectors import (
     Rotation,
@@ -38,8 +38,6 @@ _SAME, _WORTH = 0.99, 0.05
 # Boxes are apart where they are so by more than this, m; the nearest point is another where it is nearer by it.
 _APART = 1e-9
 
-_nearest = convex("box", "box")
-
 
 def box_box(a: Body, b: Body) -> list[Point]:
     """Up to eight corners of a common outline, or one crossing of edges, and the nearest point of boxes apart."""
@@ -51,10 +49,10 @@ def box_box(a: Body, b: Body) -> list[Point]:
     first = first._replace(distance=jnp.where(~is_face & apart, jnp.inf, first.distance))
     rest = [point._replace(distance=jnp.where(is_face, point.distance, jnp.inf)) for point in outline[1:]]
     manifold = [first, *rest]
-    nearest = _nearest(a, b)[0]
+    closest = nearest("box", "box", a, b, apart)
     least = fold(jnp.minimum, [point.distance for point in manifold])
-    new = apart & (nearest.distance < least - _APART)
-    return [*manifold, nearest._replace(distance=jnp.where(new, nearest.distance, jnp.inf))]
+    new = apart & (closest.distance < least - _APART)
+    return [*manifold, closest._replace(distance=jnp.where(new, closest.distance, jnp.inf))]
 
 
 def _axis(a: Body, b: Body) -> tuple[Array, Array, Array, Array, Array]:

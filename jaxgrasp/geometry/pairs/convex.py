@@ -48,10 +48,15 @@ def convex(kind_a: str, kind_b: str) -> Callable[[Body, Body], list[Point]]:
     """Touches of two convex geoms of the given kinds, one point."""
 
     def touch(a: Body, b: Body) -> list[Point]:
-        direction, simplex = search(kind_a, kind_b, *jax.tree.map(lax.stop_gradient, (a, b)))
-        return [_solve(kind_a, kind_b, a, b, direction, simplex)]
+        return [nearest(kind_a, kind_b, a, b, jnp.ones(a.position.x.shape, bool))]
 
     return touch
+
+
+def nearest(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> Point:
+    """The point of two convex geoms; of lanes that are not wanted a meaningless one."""
+    direction, simplex = search(kind_a, kind_b, *jax.tree.map(lax.stop_gradient, (a, b)), wanted)
+    return _solve(kind_a, kind_b, a, b, direction, simplex)
 
 
 class _Side(NamedTuple):

@@ -64,15 +64,18 @@ Support = Callable[[Vector], Corners]
 class _State(NamedTuple):
     """Of the climbs, lane by lane."""
 
-    count: Array  # climbing steps so far, ()
+    steps: Array  # climbing steps so far, ()
     attempt: Array  # which start this climb began with
     d: Vector  # where this climb is
     best: tuple[Array, Vector, Simplex]  # the largest separation so far, where, and the corners there
     done: Array
 
 
-def search(kind_a: str, kind_b: str, a: Body, b: Body) -> tuple[Vector, Simplex]:
-    """The direction from a to b along which they are farthest apart, and the corners that are nearest."""
+def search(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> tuple[Vector, Simplex]:
+    """The direction from a to b along which they are farthest apart, and the corners that are nearest.
+
+    Only of the lanes that are wanted; the others cost nothing once these are found.
+    """
     start = b.position - a.position
     length = norm(start)
     zero = zeros(length)
@@ -95,14 +98,14 @@ def search(kind_a: str, kind_b: str, a: Body, b: Body) -> tuple[Vector, Simplex]
         on_top = after - here <= _GAIN * (jnp.abs(here) + 1e-6)
         attempt = jnp.where(on_top, state.attempt + 1, state.attempt)
         done = state.done | (here > 0) | (attempt > len(_TILTS))
-        return _State(state.count + 1, attempt, choose(on_top, _tilted(best[1], attempt), toward), best, done)
+        return _State(state.steps + 1, attempt, choose(on_top, _tilted(best[1], attempt), toward), best, done)
 
     empty = Corners(zero, zero, zero)
     simplex = Simplex((empty, empty, empty), (zero.x, zero.x, zero.x))
     d = choose(length > 0, unit(start), axis(2, length))
     none = jnp.zeros(length.shape, jnp.int32)
-    state = _State(none.sum(), none, d, (jnp.full_like(length, -jnp.inf), d, simplex), none > 0)
-    state = lax.while_loop(lambda state: (state.count < _CLIMBS) & ~jnp.all(state.done), climb, state)
+    state = _State(none.sum(), none, d, (jnp.full_like(length, -jnp.inf), d, simplex), ~wanted)
+    state = lax.while_loop(lambda state: (state.steps < _CLIMBS) & ~jnp.all(state.done), climb, state)
     return state.best[1], state.best[2]
 
 
