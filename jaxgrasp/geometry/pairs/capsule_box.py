@@ -58,7 +58,9 @@ def _nearest(centre: Vector, half: Vector, size: Vector) -> _Nearest:
         best = candidate if best is None else _closer(best, candidate, 0.0)
     for axis in range(3):
         for signs in itertools.product((-1, 1), repeat=2):
-            best = _closer(best, fenced(partial(_edge, axis=axis, signs=signs[::-1]))(centre, half, size), _TIE)
+            best = _closer(
+                best, fenced(partial(_edge, axis=axis, signs=(signs[1], signs[0])))(centre, half, size), _TIE
+            )
     return best
 
 

@@ -55,7 +55,7 @@ def convex(kind_a: str, kind_b: str) -> Callable[[Body, Body], list[Point]]:
 
 def nearest(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> Point:
     """The point of two convex geoms; of lanes that are not wanted a meaningless one."""
-    direction, simplex = search(kind_a, kind_b, *jax.tree.map(lax.stop_gradient, (a, b)), wanted)
+    direction, simplex = search(kind_a, kind_b, lax.stop_gradient(a), lax.stop_gradient(b), wanted)
     return _solve(kind_a, kind_b, a, b, direction, simplex)
 
 
@@ -69,6 +69,7 @@ class _Side(NamedTuple):
 
     def spread(self, d: Vector) -> Vector:
         """The ellipsoid's matrix times d."""
+        assert self.axes is not None
         return rotate(self.rotation, each(lambda s, x: s * s * x, self.axes, unrotate(self.rotation, d)))
 
 

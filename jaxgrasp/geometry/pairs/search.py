@@ -171,7 +171,9 @@ def _reduced(simplex: Simplex, new: Corners) -> tuple[Simplex, Array]:
         shares[i], shares[(i + 1) % 3] = share, 1 - share
         better = value < best
         best, weights, place = choose(
-            better, (value, tuple(shares), jnp.full_like(place, (i + 1) % 3)), (best, weights, place)
+            better,
+            (value, (shares[0], shares[1], shares[2]), jnp.full_like(place, (i + 1) % 3)),
+            (best, weights, place),
         )
     for i, j, slot in _FACES:
         share_i, share_j, value = fenced(_face_foot)(old[i] - point, old[j] - point, point, present[i] & present[j])
@@ -179,7 +181,7 @@ def _reduced(simplex: Simplex, new: Corners) -> tuple[Simplex, Array]:
         shares[i], shares[j], shares[slot] = share_i, share_j, 1 - share_i - share_j
         better = value < best
         best, weights, place = choose(
-            better, (value, tuple(shares), jnp.full_like(place, slot)), (best, weights, place)
+            better, (value, (shares[0], shares[1], shares[2]), jnp.full_like(place, slot)), (best, weights, place)
         )
     corners = tuple(choose(place == i, new, corner) for i, corner in enumerate(simplex.corners))
     return Simplex((corners[0], corners[1], corners[2]), weights), best
