@@ -1,7 +1,7 @@
 """A capsule and a box: the nearest point, and a second one where the capsule lies along the box.
 
-The rules are MuJoCo's. The nearest point of the axis to the box is one of its ends above a face, or the nearest point to
-one of the twelve edges. From there the axis is followed to where it still lies above the box, and the sphere there
+The rules are MuJoCo's. The nearest point of the axis to the box is one of its ends above a face, or the nearest point
+to one of the twelve edges. From there the axis is followed to where it still lies above the box, and the sphere there
 is the second point.
 """
 
@@ -58,7 +58,9 @@ def _nearest(centre: Vector, half: Vector, size: Vector) -> _Nearest:
         best = candidate if best is None else _closer(best, candidate, 0.0)
     for axis in range(3):
         for signs in itertools.product((-1, 1), repeat=2):
-            best = _closer(best, fenced(partial(_edge, axis=axis, signs=signs[::-1]))(centre, half, size), _TIE)
+            best = _closer(
+                best, fenced(partial(_edge, axis=axis, signs=(signs[1], signs[0])))(centre, half, size), _TIE
+            )
     return best
 
 

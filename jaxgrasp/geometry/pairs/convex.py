@@ -1,13 +1,13 @@
 """Any two convex geoms: the direction that separates them most, and the two points that are nearest along it.
 
-Every geom is a polyhedron (a point, a segment, a box, a hull) plus an ellipsoid, possibly flat (of ellipsoids, and a disc
-of cylinders), plus a ball. For a unit direction d the separation is
+Every geom is a polyhedron (a point, a segment, a box, a hull) plus an ellipsoid (a disc for cylinders), plus a ball.
+For a unit direction d the separation is
 
     s(d) = min over b of d.b - max over a of d.a,
 
-and the signed distance is its maximum over d. The search finds which corners of the polyhedra take part and about which
-d. Then d and the points follow from those corners: in closed form for polyhedra, by Newton's method where there is an
-ellipsoid, with derivatives of the last step alone, which are those of the solution.
+and the signed distance is its maximum over d. The search finds which corners of the polyhedra take part and about
+which d. Then d and the points follow from those corners: in closed form for polyhedra, by Newton's method where there
+is an ellipsoid, with derivatives of the last step alone, which are those of the solution.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,8 @@ from jaxgrasp.geometry.pairs.vectors import (
     cross,
     dot,
     each,
-    norm,
+    least_along,
+    pick,
     root,
     rotate,
     unit,
@@ -47,14 +48,19 @@ def convex(kind_a: str, kind_b: str) -> Callable[[Body, Body], list[Point]]:
     """Touches of two convex geoms of the given kinds, one point."""
 
     def touch(a: Body, b: Body) -> list[Point]:
-        direction, simplex = search(kind_a, kind_b, *jax.tree.map(lax.stop_gradient, (a, b)))
-        return [_solve(kind_a, kind_b, a, b, direction, simplex)]
+        return [nearest(kind_a, kind_b, a, b, jnp.ones(a.position.x.shape, bool))]
 
     return touch
 
 
+def nearest(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> Point:
+    """The point of two convex geoms; of lanes that are not wanted a meaningless one."""
+    direction, simplex = search(kind_a, kind_b, lax.stop_gradient(a), lax.stop_gradient(b), wanted)
+    return _solve(kind_a, kind_b, a, b, direction, simplex)
+
+
 class _Side(NamedTuple):
-    """What of a geom takes part: a corner, edges from it, and the ellipsoid with matrix rotation diag(axes^2) rotation'."""
+    """What of a geom takes part: a corner, edges from it, and the ellipsoid of the given axes."""
 
     corner: Vector  # common frame
     edges: list[Vector]  # zero where there is none
@@ -63,6 +69,7 @@ class _Side(NamedTuple):
 
     def spread(self, d: Vector) -> Vector:
         """The ellipsoid's matrix times d."""
+        assert self.axes is not None
         return rotate(self.rotation, each(lambda s, x: s * s * x, self.axes, unrotate(self.rotation, d)))
 
 
@@ -79,11 +86,13 @@ def _solve(kind_a: str, kind_b: str, a: Body, b: Body, direction: Vector, simple
     fixed = dot(second, second) > 0
     normal = unit(cross(first, second))
     flat = choose(dot(normal, direction) < 0, -normal, normal)
-    d = direction
     if is_smooth(kind_a) or is_smooth(kind_b):
         held = jax.tree.map(lax.stop_gradient, (between, first, sides))
-        d = lax.fori_loop(0, _STEPS, lambda _, d: _newton(d, *held), d)
-    d = choose(fixed, flat, fenced(_newton)(d, between, first, sides))
+        d = lax.fori_loop(0, _STEPS, lambda _, d: _newton(d, *held), direction)
+        free = fenced(_newton)(d, between, first, sides)
+    else:
+        free = _straight(between, first, direction)
+    d = choose(fixed, flat, free)
     apart = between - _bulge(sides[0], d) - _bulge(sides[1], d)
     separation = dot(d, apart)
     # a's point and b's are corner + edges + ellipsoid's point; their difference is separation times d.
@@ -95,14 +104,16 @@ def _solve(kind_a: str, kind_b: str, a: Body, b: Body, direction: Vector, simple
 
 def _side(kind: str, body: Body, corners: list[Vector], weights: tuple[Array, ...], direction: Vector) -> _Side:
     """`corners` are local, `weights` what they weigh in the nearest point."""
-    heavy = (weights[0] >= weights[1]) & (weights[0] >= weights[2])
-    main = choose(heavy, corners[0], choose(weights[1] >= weights[2], corners[1], corners[2]))
     limit = _TOLERANCE[direction.x.dtype]
     zero = zeros(direction.x)
-    edges = [
-        rotate(body.rotation, choose(weight > limit, corner - main, zero))
-        for corner, weight in zip(corners, weights, strict=True)
-    ]
+    main, edges = corners[0], []
+    if kind not in ("sphere", "ellipsoid"):
+        slots = list(zip(corners, weights, strict=True))
+        first = (weights[0] >= weights[1]) & (weights[0] >= weights[2])
+        last = ~first & (weights[2] > weights[1])
+        main = choose(first, corners[0], choose(last, corners[2], corners[1]))
+        for corner, weight in (choose(first, slots[1], slots[0]), choose(last, slots[1], slots[2])):
+            edges.append(rotate(body.rotation, choose(weight > limit, corner - main, zero)))
     axes = roundness(kind, body)
     if kind == "cylinder":
         # On a cap every direction within it is an edge.
@@ -115,17 +126,16 @@ def _side(kind: str, body: Body, corners: list[Vector], weights: tuple[Array, ..
 
 def _independent(sides: _Sides) -> tuple[Vector, Vector, tuple[Array, Array]]:
     """Two edges that the direction is normal to, zero where there are none, and whether they are a's."""
-    edges = [(edge, own) for side, own in zip(sides, (True, False), strict=True) for edge in side.edges]
+    edges, like = [*sides[0].edges, *sides[1].edges], sides[0].corner.x
 
     def best(score: Callable[[Vector], Array], least: float) -> tuple[Vector, Array]:
-        chosen = zeros(edges[0][0].x)
-        top, whose = jnp.full_like(chosen.x, least), jnp.zeros(chosen.x.shape, bool)
-        for edge, own in edges:
+        top, number = jnp.full_like(like, least), jnp.zeros(like.shape, jnp.int32)
+        for i, edge in enumerate(edges, 1):
             value = lax.stop_gradient(score(edge))
-            top, chosen, whose = choose(
-                value > top, (value, edge, jnp.full_like(whose, own)), (top, chosen, whose)
-            )
-        return chosen, whose
+            number = jnp.where(value > top, i, number)
+            top = jnp.maximum(value, top)
+        chosen = pick([zeros(like), *edges], number)
+        return chosen, (number > 0) & (number <= len(sides[0].edges))
 
     def sine(edge: Vector) -> Array:
         across = cross(along, edge)
@@ -145,12 +155,19 @@ def _bulge(side: _Side, d: Vector) -> Vector:
     return spread * safe_divide(jnp.ones_like(d.x), root(dot(d, spread)))
 
 
+def _straight(between: Vector, edge: Vector, direction: Vector) -> Vector:
+    """Between two corners, or a corner and an edge."""
+    edge = unit(edge)
+    d = unit(between - edge * dot(edge, between))
+    return choose(dot(d, direction) < 0, -d, d)
+
+
 def _newton(d: Vector, between: Vector, edge: Vector, sides: _Sides) -> Vector:
     """A step towards the largest separation among directions normal to the edge."""
     edge = unit(edge)
     d = unit(d - edge * dot(edge, d))
     free = dot(edge, edge) < 0.5
-    one = unit(cross(d, choose(free, _least_along(d), edge)))
+    one = unit(cross(d, choose(free, least_along(d), edge)))
     two = cross(d, one)
     apart = between - _bulge(sides[0], d) - _bulge(sides[1], d)
     s = dot(d, apart)
@@ -182,11 +199,3 @@ def _along_edges(wanted: Vector, first: Vector, second: Vector, owners: tuple[Ar
     x = jnp.where(yy > 0, safe_divide(u * yy - v * xy, determinant), safe_divide(u, xx))
     y = safe_divide(v * xx - u * xy, determinant)
     return first * jnp.where(owners[0], x, 0) + second * jnp.where(owners[1], y, 0)
-
-
-def _least_along(d: Vector) -> Vector:
-    """The axis that d is least along."""
-    x, y, z = (jnp.abs(d[i]) for i in range(3))
-    is_x = (x <= y) & (x <= z)
-    is_y = ~is_x & (y <= z)
-    return Vector(*(jnp.where(mark, 1, 0).astype(d.x.dtype) for mark in (is_x, is_y, ~is_x & ~is_y)))

@@ -46,8 +46,8 @@ class Geom(NamedTuple):
     rotation: Array
     """(3, 3, *lanes), columns are the geom's axes in the common frame."""
     size: Array
-    """(3, *lanes), m: sphere (radius, _, _), capsule and cylinder (radius, half length along z, _), ellipsoid semi-axes,
-    box half extents; of a mesh not used. A capsule's half length is without the half balls."""
+    """(3, *lanes), m: sphere (radius, _, _), capsule and cylinder (radius, half length along z, _), ellipsoid
+    semi-axes, box half extents; of a mesh not used. A capsule's half length is without the half balls."""
     hull: Hull | None = None
     """Of a mesh."""
 
@@ -60,7 +60,7 @@ class Touch(NamedTuple):
     normal: Array
     """(k, 3, *lanes), unit, from a to b."""
     distance: Array
-    """(k, *lanes), of the surfaces along the normal, m: negative inside each other, +inf in slots that hold no point."""
+    """(k, *lanes), of the surfaces along the normal, m: negative inside each other, +inf in slots without a point."""
 
 
 class Body(NamedTuple):

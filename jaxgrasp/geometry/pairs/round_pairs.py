@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxgrasp.geometry.pairs.geom import Body, Point
-from jaxgrasp.geometry.pairs.vectors import Vector, axis, choose, dot, norm, pick, rotate, unit, unrotate
+from jaxgrasp.geometry.pairs.vectors import Vector, axis, choose, dot, norm, rotate, unit, unrotate
 
 Surface = Callable[[Vector, Vector], tuple[Array, Vector]]
 
-# Axes of capsules are parallel where the product of their squared lengths, m^2, times the squared sine of their angle is
-# below this.
+# Axes of capsules are parallel where the product of their squared lengths, m^2, and the squared sine of their angle
+# is below this.
 _PARALLEL = 1e-15
 
 
@@ -33,11 +33,7 @@ def around(centre: Vector, radius: Array, b: Body, surface: Surface) -> Point:
 
 
 def capsule_capsule(a: Body, b: Body) -> list[Point]:
-    """One point of two capsules; two where their axes are parallel.
-
-    Parallel ones touch along a line. Of the ends of a and b and their nearest points on the other axis the first two
-    that penetrate count, then the nearest.
-    """
+    """One point of two capsules; two where their axes are parallel: the ends of where they lie side by side."""
     half_a, half_b = a.rotation[2] * a.size[1], b.rotation[2] * b.size[1]
     apart = a.position - b.position
     aa, ab, bb = dot(half_a, half_a), -dot(half_a, half_b), dot(half_b, half_b)
@@ -51,26 +47,12 @@ def capsule_capsule(a: Body, b: Body) -> list[Point]:
     def between(x: Array, y: Array) -> Point:
         return _two_spheres(a.position + half_a * x, a.size[0], b.position + half_b * y, b.size[0])
 
-    one = jnp.ones_like(x)
-    ends = [between(one * end, jnp.clip((v - ab * end) / bb, -1, 1)) for end in (1, -1)]
-    ends += [between(jnp.clip((u - ab * end) / aa, -1, 1), one * end) for end in (1, -1)]
-    order = [jnp.where(end.distance <= 0, -1 - 1 / (i + 1), end.distance) for i, end in enumerate(ends)]
-    first, second = (pick(ends, index) for index in _first_two(order))
-    first = choose(crossed, between(x, y), first)
-    return [first, second._replace(distance=jnp.where(crossed, jnp.inf, second.distance))]
-
-
-def _first_two(values: list[Array]) -> tuple[Array, Array]:
-    """Which of some values is the least and which the next."""
-    first, second = (jnp.zeros(values[0].shape, jnp.int32) for _ in range(2))
-    least = jnp.full_like(values[0], jnp.inf)
-    next_least = least
-    for i, value in enumerate(values):
-        best, good = value < least, value < next_least
-        second = jnp.where(best, first, jnp.where(good, i, second))
-        next_least = jnp.where(best, least, jnp.where(good, value, next_least))
-        first, least = jnp.where(best, i, first), jnp.where(best, value, least)
-    return first, second
+    # The ends of b along a's axis, -1 and 1 being those of a.
+    ends = (u + ab) / aa, (u - ab) / aa
+    low, high = jnp.maximum(jnp.minimum(*ends), -1), jnp.minimum(jnp.maximum(*ends), 1)
+    parallel = [between(x, jnp.clip((v - ab * x) / bb, -1, 1)) for x in (jnp.clip(low, -1, 1), jnp.clip(high, -1, 1))]
+    second = parallel[1]._replace(distance=jnp.where(crossed | (high <= low), jnp.inf, parallel[1].distance))
+    return [choose(crossed, between(x, y), parallel[0]), second]
 
 
 def _two_spheres(p: Vector, radius_p: Array, q: Vector, radius_q: Array) -> Point:

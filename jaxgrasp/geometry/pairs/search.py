@@ -14,14 +14,16 @@ from jax import Array, lax
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.geom import Body
-from jaxgrasp.geometry.pairs.supports import bulge, corner, is_smooth
+from jaxgrasp.geometry.pairs.supports import bulge, corner
 from jaxgrasp.geometry.pairs.vectors import (
     Vector,
     axis,
     choose,
     cross,
     dot,
+    least_along,
     norm,
+    pick,
     rotate,
     unit,
     unrotate,
@@ -29,12 +31,16 @@ from jaxgrasp.geometry.pairs.vectors import (
 )
 
 # Directions tried, and points tried for each.
-_CLIMBS = 12
+_CLIMBS = 40
 _ROUNDS = 48
 # A convex set's nearest point is found to this, relative to its squared distance.
-_GAP = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
+_GAP = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-5}
+# The climb ends where it gains less than this share of the separation.
+_GAIN = 1e-3
+# Inside each other, the maxima next to the one found are tried from these directions aside (tangents of the angles).
+_TILTS = ((0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))
 # Geoms inside each other are moved apart by this share of (their depth + 1 cm).
-_SLACK = {"smooth": 1e-2, "sharp": 1e-2}
+_SLACK = 1e-2
 
 
 class Corners(NamedTuple):
@@ -55,44 +61,68 @@ class Simplex(NamedTuple):
 Support = Callable[[Vector], Corners]
 
 
-def search(kind_a: str, kind_b: str, a: Body, b: Body) -> tuple[Vector, Simplex]:
-    """The direction from a to b along which they are farthest apart, and the corners that are nearest."""
-    slack = _SLACK["smooth" if is_smooth(kind_a) or is_smooth(kind_b) else "sharp"]
+class _State(NamedTuple):
+    """Of the climbs, lane by lane."""
+
+    steps: Array  # climbing steps so far, ()
+    attempt: Array  # which start this climb began with
+    d: Vector  # where this climb is
+    best: tuple[Array, Vector, Simplex]  # the largest separation so far, where, and the corners there
+    done: Array
+
+
+def search(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> tuple[Vector, Simplex]:
+    """The direction from a to b along which they are farthest apart, and the corners that are nearest.
+
+    Only of the lanes that are wanted; the others cost nothing once these are found.
+    """
     start = b.position - a.position
     length = norm(start)
-    d = choose(length > 0, unit(start), axis(2, length))
+    zero = zeros(length)
 
-    def support(d: Vector, shift: Vector) -> Corners:
-        return _support(kind_a, kind_b, a, b, d, shift)
+    def support(d: Vector) -> Corners:
+        return _support(kind_a, kind_b, a, b, d)
 
-    def climb(state: tuple[Array, Vector, Simplex, Array]) -> tuple[Array, Vector, Simplex, Array]:
-        count, d, simplex, done = state
-        here = dot(d, support(d, zeros(length)).point)
+    def climb(state: _State) -> _State:
+        d = state.d
+        first = support(d)
+        here = dot(d, first.point)
         out = jnp.maximum(-here, 0)
-        shift = d * jnp.where(here > 0, 0, out + slack * (out + 0.01))
-        found = _nearest(lambda d: support(d, shift), d)
+        shift = d * jnp.where(here > 0, 0, out + _SLACK * (out + 0.01))
+        found = _nearest(support, first, shift)
         toward = unit(_combined(found))
         toward = choose(dot(toward, toward) > 0.5, toward, d)
-        after = dot(toward, support(toward, zeros(length)).point)
-        better = ~done & (after >= here)
-        done = done | (here > 0) | (after - here <= 1e-9 * (jnp.abs(here) + 1e-6))
-        return count + 1, choose(better, toward, d), choose(better | (count == 0), found, simplex), done
+        after = dot(toward, support(toward).point)
+        better = ~state.done & (after > state.best[0])
+        best = choose(better, (after, toward, found), state.best)
+        on_top = after - here <= _GAIN * (jnp.abs(here) + 1e-6)
+        attempt = jnp.where(on_top, state.attempt + 1, state.attempt)
+        done = state.done | (here > 0) | (attempt > len(_TILTS))
+        return _State(state.steps + 1, attempt, choose(on_top, _tilted(best[1], attempt), toward), best, done)
 
-    zero = zeros(length)
     empty = Corners(zero, zero, zero)
     simplex = Simplex((empty, empty, empty), (zero.x, zero.x, zero.x))
-    state = (jnp.zeros((), jnp.int32), d, simplex, jnp.zeros(length.shape, bool))
-    state = lax.while_loop(lambda state: (state[0] < _CLIMBS) & ~jnp.all(state[3]), climb, state)
-    return state[1], state[2]
+    d = choose(length > 0, unit(start), axis(2, length))
+    none = jnp.zeros(length.shape, jnp.int32)
+    state = _State(none.sum(), none, d, (jnp.full_like(length, -jnp.inf), d, simplex), ~wanted)
+    state = lax.while_loop(lambda state: (state.steps < _CLIMBS) & ~jnp.all(state.done), climb, state)
+    return state.best[1], state.best[2]
 
 
-def _support(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector, shift: Vector) -> Corners:
-    """The least of b + shift - a along d."""
+def _tilted(d: Vector, attempt: Array) -> Vector:
+    """The start of an attempt, aside of the best direction so far."""
+    one = unit(cross(d, least_along(d)))
+    two = cross(d, one)
+    return unit(pick([d, *(d + one * x + two * y for x, y in _TILTS)], attempt))
+
+
+def _support(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector) -> Corners:
+    """The least of b - a along d."""
     toward_a, toward_b = unrotate(a.rotation, d), unrotate(b.rotation, -d)
     corner_a, corner_b = corner(kind_a, a, toward_a), corner(kind_b, b, toward_b)
     point_a = rotate(a.rotation, corner_a + bulge(kind_a, a, toward_a))
     point_b = rotate(b.rotation, corner_b + bulge(kind_b, b, toward_b))
-    return Corners(b.position - a.position + shift + point_b - point_a, corner_a, corner_b)
+    return Corners(b.position - a.position + point_b - point_a, corner_a, corner_b)
 
 
 def _combined(simplex: Simplex) -> Vector:
@@ -100,13 +130,13 @@ def _combined(simplex: Simplex) -> Vector:
     return one + two + three
 
 
-def _nearest(support: Support, d: Vector) -> Simplex:
-    """The simplex that holds the nearest point of a convex set, which must not hold the origin."""
-    first = support(d)
-    zero = zeros(d.x)
+def _nearest(support: Support, first: Corners, shift: Vector) -> Simplex:
+    """The simplex that holds the nearest of all points b - a + shift, which must not hold the origin."""
+    zero = zeros(shift.x)
     empty = Corners(zero, zero, zero)
-    start = Simplex((first, empty, empty), (jnp.ones_like(d.x), zero.x, zero.x))
-    dtype = d.x.dtype
+    moved = first._replace(point=first.point + shift)
+    start = Simplex((moved, empty, empty), (jnp.ones_like(shift.x), zero.x, zero.x))
+    dtype = shift.x.dtype
     rounding = 8 * float(jnp.finfo(dtype).eps)
 
     def add(state: tuple[Array, Simplex, Array]) -> tuple[Array, Simplex, Array]:
@@ -114,13 +144,14 @@ def _nearest(support: Support, d: Vector) -> Simplex:
         nearest = _combined(simplex)
         squared = dot(nearest, nearest)
         new = support(unit(nearest))
+        new = new._replace(point=new.point + shift)
         gap = squared - dot(nearest, new.point)
         done = done | (gap <= _GAP[dtype] * squared + rounding * norm(nearest) * norm(new.point))
         reduced, value = _reduced(simplex, new)
         closer = value < squared * (1 - rounding)
         return count + 1, choose(done | ~closer, simplex, reduced), done | ~closer
 
-    state = (jnp.zeros((), jnp.int32), start, jnp.zeros(d.x.shape, bool))
+    state = (jnp.zeros((), jnp.int32), start, jnp.zeros(shift.x.shape, bool))
     return lax.while_loop(lambda state: (state[0] < _ROUNDS) & ~jnp.all(state[2]), add, state)[1]
 
 
@@ -139,13 +170,19 @@ def _reduced(simplex: Simplex, new: Corners) -> tuple[Simplex, Array]:
         shares = [zero, zero, zero]
         shares[i], shares[(i + 1) % 3] = share, 1 - share
         better = value < best
-        best, weights, place = choose(better, (value, tuple(shares), jnp.full_like(place, (i + 1) % 3)), (best, weights, place))
+        best, weights, place = choose(
+            better,
+            (value, (shares[0], shares[1], shares[2]), jnp.full_like(place, (i + 1) % 3)),
+            (best, weights, place),
+        )
     for i, j, slot in _FACES:
         share_i, share_j, value = fenced(_face_foot)(old[i] - point, old[j] - point, point, present[i] & present[j])
         shares = [zero, zero, zero]
         shares[i], shares[j], shares[slot] = share_i, share_j, 1 - share_i - share_j
         better = value < best
-        best, weights, place = choose(better, (value, tuple(shares), jnp.full_like(place, slot)), (best, weights, place))
+        best, weights, place = choose(
+            better, (value, (shares[0], shares[1], shares[2]), jnp.full_like(place, slot)), (best, weights, place)
+        )
     corners = tuple(choose(place == i, new, corner) for i, corner in enumerate(simplex.corners))
     return Simplex((corners[0], corners[1], corners[2]), weights), best
 

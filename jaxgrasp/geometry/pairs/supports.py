@@ -18,7 +18,7 @@ def corner(kind: str, body: Body, d: Vector) -> Vector:
         return Vector(zero, zero, jnp.where(d.z < 0, -body.size[1], body.size[1]))
     if kind == "box":
         return each(lambda along, half: jnp.where(along < 0, -half, half), d, body.size)
-    if kind == "mesh":
+    if body.hull is not None:
         return _farthest(body.hull.vertices.astype(d.x.dtype), d)
     return zeros(d.x)
 

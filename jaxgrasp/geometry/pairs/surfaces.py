@@ -7,7 +7,7 @@ from jax import Array, lax
 from jaxgrasp.arrays import fold, safe_divide
 from jaxgrasp.geometry.pairs.vectors import Vector, axis, choose, each, norm, unit
 
-# Newton's steps for the ellipsoid's multiplier: eight from its lower bound give it to rounding for ratios of axes to 20.
+# Newton's steps for the ellipsoid's multiplier, from its lower bound.
 _STEPS = 8
 
 
@@ -52,8 +52,8 @@ def to_ellipsoid(point: Vector, size: Vector) -> tuple[Array, Vector]:
     """See `to_sphere`.
 
     The nearest point of the surface is a^2 p / (a^2 + t) with the t > -min a^2 at which it is on the surface,
-    |a p / (a^2 + t)| = 1: the largest root. From below, Newton's steps on the reciprocal of that norm, which is concave,
-    never pass it.
+    |a p / (a^2 + t)| = 1: the largest root. From below, Newton's steps on the reciprocal of that norm, which is
+    concave, never pass it.
     """
     squared = each(jnp.multiply, size, size)
 

@@ -33,18 +33,23 @@ class Vector:
         return jnp.stack([self.x, self.y, self.z])
 
     def __getitem__(self, index: int) -> Array:
+        """A component."""
         return (self.x, self.y, self.z)[index]
 
     def __add__(self, other: "Vector") -> "Vector":
+        """Sum."""
         return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
 
     def __sub__(self, other: "Vector") -> "Vector":
+        """Difference."""
         return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
 
     def __neg__(self) -> "Vector":
+        """The opposite."""
         return Vector(-self.x, -self.y, -self.z)
 
     def __mul__(self, scale: ArrayLike) -> "Vector":
+        """A number, or one a lane, times the vector."""
         return Vector(self.x * scale, self.y * scale, self.z * scale)
 
     __rmul__ = __mul__
@@ -93,6 +98,14 @@ def zeros(like: Array) -> Vector:
 def axis(number: int, like: Array) -> Vector:
     """The x, y or z axis."""
     return Vector(*(jnp.full_like(like, float(i == number)) for i in range(3)))
+
+
+def least_along(d: Vector) -> Vector:
+    """The axis that d is least along."""
+    x, y, z = (jnp.abs(d[i]) for i in range(3))
+    is_x = (x <= y) & (x <= z)
+    is_y = ~is_x & (y <= z)
+    return Vector(*(jnp.where(mark, 1, 0).astype(d.x.dtype) for mark in (is_x, is_y, ~is_x & ~is_y)))
 
 
 def rotate(rotation: Rotation, a: Vector) -> Vector:
