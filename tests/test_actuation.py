@@ -120,8 +120,7 @@ def least(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray, margin
 
 HANDS = {
     "an actuator a joint": make(3, JOINTS, redundant=False, compliant=False),
-    "two joint directions unreached": make(3, JOINTS - 2, redundant=False, compliant=True),
-    "two unreached, one reached twice": make(3, JOINTS - 2, redundant=True, compliant=False),
+    "two joint directions unreached, one reached twice": make(3, JOINTS - 2, redundant=True, compliant=True),
 }
 
 
@@ -162,7 +161,7 @@ def test_least_effort_is_that_of_clarabel():
 @pytest.fixture(scope="module")
 def moved():
     """What depends on the data along a line through them: data at t, and the margin there."""
-    hand, rng = HANDS["two joint directions unreached"], np.random.default_rng(0)
+    hand, rng = HANDS["two joint directions unreached, one reached twice"], np.random.default_rng(0)
     start = {
         "positions": hand.contacts.positions,
         "jacobian": jnp.asarray(hand.jacobian),
@@ -198,7 +197,7 @@ def test_derivatives_are_central_differences(moved, program):
     forward = np.asarray(jax.jit(lambda t: jax.jvp(answer, (t,), (1.0,))[1])(0.0)).reshape(BATCH, -1)
     answered = np.isfinite(numeric).all(-1) & np.isfinite(np.asarray(known(0.0)).reshape(BATCH, -1)).all(-1)
     off = np.abs(forward - numeric).max(-1)[answered] / np.maximum(1, np.abs(numeric).max(-1)[answered])
-    assert answered.sum() >= BATCH / 3
+    assert answered.sum() >= 10
     # Where a row becomes active within the step there is a kink.
     assert np.quantile(off, 0.9) <= SMOOTHED
     weights = np.random.default_rng(1).normal(size=forward.shape)
