@@ -29,6 +29,7 @@ from jaxgrasp.geometry.pairs.vectors import (
     cross,
     dot,
     each,
+    least_along,
     norm,
     root,
     rotate,
@@ -150,7 +151,7 @@ def _newton(d: Vector, between: Vector, edge: Vector, sides: _Sides) -> Vector:
     edge = unit(edge)
     d = unit(d - edge * dot(edge, d))
     free = dot(edge, edge) < 0.5
-    one = unit(cross(d, choose(free, _least_along(d), edge)))
+    one = unit(cross(d, choose(free, least_along(d), edge)))
     two = cross(d, one)
     apart = between - _bulge(sides[0], d) - _bulge(sides[1], d)
     s = dot(d, apart)
@@ -182,11 +183,3 @@ def _along_edges(wanted: Vector, first: Vector, second: Vector, owners: tuple[Ar
     x = jnp.where(yy > 0, safe_divide(u * yy - v * xy, determinant), safe_divide(u, xx))
     y = safe_divide(v * xx - u * xy, determinant)
     return first * jnp.where(owners[0], x, 0) + second * jnp.where(owners[1], y, 0)
-
-
-def _least_along(d: Vector) -> Vector:
-    """The axis that d is least along."""
-    x, y, z = (jnp.abs(d[i]) for i in range(3))
-    is_x = (x <= y) & (x <= z)
-    is_y = ~is_x & (y <= z)
-    return Vector(*(jnp.where(mark, 1, 0).astype(d.x.dtype) for mark in (is_x, is_y, ~is_x & ~is_y)))

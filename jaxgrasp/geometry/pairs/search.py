@@ -14,14 +14,16 @@ from jax import Array, lax
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.geom import Body
-from jaxgrasp.geometry.pairs.supports import bulge, corner, is_smooth
+from jaxgrasp.geometry.pairs.supports import bulge, corner
 from jaxgrasp.geometry.pairs.vectors import (
     Vector,
     axis,
     choose,
     cross,
     dot,
+    least_along,
     norm,
+    pick,
     rotate,
     unit,
     unrotate,
@@ -29,12 +31,16 @@ from jaxgrasp.geometry.pairs.vectors import (
 )
 
 # Directions tried, and points tried for each.
-_CLIMBS = 12
+_CLIMBS = 40
 _ROUNDS = 48
 # A convex set's nearest point is found to this, relative to its squared distance.
-_GAP = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
+_GAP = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-5}
+# The climb ends where it gains less than this share of the separation.
+_GAIN = 1e-3
+# Inside each other, the maxima next to the one found are tried from these directions aside (tangents of the angles).
+_TILTS = ((0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))
 # Geoms inside each other are moved apart by this share of (their depth + 1 cm).
-_SLACK = {"smooth": 1e-2, "sharp": 1e-2}
+_SLACK = 1e-2
 
 
 class Corners(NamedTuple):
@@ -55,35 +61,55 @@ class Simplex(NamedTuple):
 Support = Callable[[Vector], Corners]
 
 
+class _State(NamedTuple):
+    """Of the climbs, lane by lane."""
+
+    count: Array  # climbing steps so far, ()
+    attempt: Array  # which start this climb began with
+    d: Vector  # where this climb is
+    best: tuple[Array, Vector, Simplex]  # the largest separation so far, where, and the corners there
+    done: Array
+
+
 def search(kind_a: str, kind_b: str, a: Body, b: Body) -> tuple[Vector, Simplex]:
     """The direction from a to b along which they are farthest apart, and the corners that are nearest."""
-    slack = _SLACK["smooth" if is_smooth(kind_a) or is_smooth(kind_b) else "sharp"]
     start = b.position - a.position
     length = norm(start)
-    d = choose(length > 0, unit(start), axis(2, length))
+    zero = zeros(length)
 
     def support(d: Vector, shift: Vector) -> Corners:
         return _support(kind_a, kind_b, a, b, d, shift)
 
-    def climb(state: tuple[Array, Vector, Simplex, Array]) -> tuple[Array, Vector, Simplex, Array]:
-        count, d, simplex, done = state
-        here = dot(d, support(d, zeros(length)).point)
+    def climb(state: _State) -> _State:
+        d = state.d
+        here = dot(d, support(d, zero).point)
         out = jnp.maximum(-here, 0)
-        shift = d * jnp.where(here > 0, 0, out + slack * (out + 0.01))
+        shift = d * jnp.where(here > 0, 0, out + _SLACK * (out + 0.01))
         found = _nearest(lambda d: support(d, shift), d)
         toward = unit(_combined(found))
         toward = choose(dot(toward, toward) > 0.5, toward, d)
-        after = dot(toward, support(toward, zeros(length)).point)
-        better = ~done & (after >= here)
-        done = done | (here > 0) | (after - here <= 1e-9 * (jnp.abs(here) + 1e-6))
-        return count + 1, choose(better, toward, d), choose(better | (count == 0), found, simplex), done
+        after = dot(toward, support(toward, zero).point)
+        better = ~state.done & (after > state.best[0])
+        best = choose(better, (after, toward, found), state.best)
+        on_top = after - here <= _GAIN * (jnp.abs(here) + 1e-6)
+        attempt = jnp.where(on_top, state.attempt + 1, state.attempt)
+        done = state.done | (here > 0) | (attempt > len(_TILTS))
+        return _State(state.count + 1, attempt, choose(on_top, _tilted(best[1], attempt), toward), best, done)
 
-    zero = zeros(length)
     empty = Corners(zero, zero, zero)
     simplex = Simplex((empty, empty, empty), (zero.x, zero.x, zero.x))
-    state = (jnp.zeros((), jnp.int32), d, simplex, jnp.zeros(length.shape, bool))
-    state = lax.while_loop(lambda state: (state[0] < _CLIMBS) & ~jnp.all(state[3]), climb, state)
-    return state[1], state[2]
+    d = choose(length > 0, unit(start), axis(2, length))
+    none = jnp.zeros(length.shape, jnp.int32)
+    state = _State(none.sum(), none, d, (jnp.full_like(length, -jnp.inf), d, simplex), none > 0)
+    state = lax.while_loop(lambda state: (state.count < _CLIMBS) & ~jnp.all(state.done), climb, state)
+    return state.best[1], state.best[2]
+
+
+def _tilted(d: Vector, attempt: Array) -> Vector:
+    """The start of an attempt, aside of the best direction so far."""
+    one = unit(cross(d, least_along(d)))
+    two = cross(d, one)
+    return unit(pick([d, *(d + one * x + two * y for x, y in _TILTS)], attempt))
 
 
 def _support(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector, shift: Vector) -> Corners:

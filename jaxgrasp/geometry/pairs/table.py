@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 
 from jaxgrasp.fence import fences
+from jaxgrasp.geometry.pairs.box_box import CORNERS, box_box
 from jaxgrasp.geometry.pairs.capsule_box import capsule_box
 from jaxgrasp.geometry.pairs.convex import convex
 from jaxgrasp.geometry.pairs.geom import Body, Geom, Point, Touch, collected
@@ -21,6 +22,8 @@ _PAIRS: dict[tuple[str, str], tuple[int, Callable[[Body, Body], list[Point]]]] =
     # Two points where the capsule lies along the other.
     ("capsule", "capsule"): (2, capsule_capsule),
     ("capsule", "box"): (2, capsule_box),
+    # Corners of a common outline or a crossing of edges, and the nearest point of boxes apart.
+    ("box", "box"): (CORNERS + 1, box_box),
     # One point, found by search.
     ("sphere", "mesh"): (1, convex("sphere", "mesh")),
     ("capsule", "ellipsoid"): (1, convex("capsule", "ellipsoid")),
@@ -33,7 +36,6 @@ _PAIRS: dict[tuple[str, str], tuple[int, Callable[[Body, Body], list[Point]]]] =
     ("cylinder", "cylinder"): (1, convex("cylinder", "cylinder")),
     ("cylinder", "box"): (1, convex("cylinder", "box")),
     ("cylinder", "mesh"): (1, convex("cylinder", "mesh")),
-    ("box", "box"): (1, convex("box", "box")),
     ("box", "mesh"): (1, convex("box", "mesh")),
     ("mesh", "mesh"): (1, convex("mesh", "mesh")),
 }

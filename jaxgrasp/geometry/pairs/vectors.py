@@ -95,6 +95,14 @@ def axis(number: int, like: Array) -> Vector:
     return Vector(*(jnp.full_like(like, float(i == number)) for i in range(3)))
 
 
+def least_along(d: Vector) -> Vector:
+    """The axis that d is least along."""
+    x, y, z = (jnp.abs(d[i]) for i in range(3))
+    is_x = (x <= y) & (x <= z)
+    is_y = ~is_x & (y <= z)
+    return Vector(*(jnp.where(mark, 1, 0).astype(d.x.dtype) for mark in (is_x, is_y, ~is_x & ~is_y)))
+
+
 def rotate(rotation: Rotation, a: Vector) -> Vector:
     """Rotation times vector: from the geom's frame to the common one."""
     return rotation[0] * a.x + rotation[1] * a.y + rotation[2] * a.z
