@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
+import jax
 import mujoco
 import numpy as np
 from test_scenes import reach
 
+from jaxgrasp.hands import HandGrasps, HandObject
 from jaxgrasp.hands.scenes import four_fingers, shadow_hand
 
 SCENES = {"four_fingers": four_fingers, "shadow_hand": shadow_hand}
+COUNT = 1000
+SLOTS = 48
+"""More than any configuration fills within the margin."""
 MARGIN = 0.002
 """C reports contacts up to this far apart, m."""
 
@@ -20,8 +26,9 @@ def model_of(scene: str, name: str) -> mujoco.MjModel:
     spec = SCENES[scene](name)
     spec.geom("object").margin = MARGIN
     model = spec.compile()
-    # Contacts within the margin push nothing yet.
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-12, 500
+    # By default C adds points, beside the nearest, where flat sides lie on each other.
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
     return model
 
 
@@ -33,10 +40,10 @@ def near_contact(model: mujoco.MjModel, count: int, seed: int) -> np.ndarray:
     hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     low, high = model.jnt_range[hinges].T
     places = model.jnt_qposadr[hinges]
-    moved = qpos[:, places] + rng.uniform(-0.15, 0.15, (count, len(hinges)))
+    moved = qpos[:, places] + rng.uniform(-0.06, 0.06, (count, len(hinges)))
     qpos[:, places] = np.clip(moved, low, high)
     start = model.jnt_qposadr[model.body("object").jntadr[0]]
-    qpos[:, start : start + 3] += rng.uniform(-0.004, 0.004, (count, 3))
+    qpos[:, start : start + 3] += rng.uniform(-0.002, 0.002, (count, 3))
     # Every fourth object comes down to the palm.
     lowest = 0.055 if model.nu == 12 else 0.04
     qpos[::4, start + 2] -= rng.uniform(0.5, 1.0, len(qpos[::4])) * lowest
@@ -144,3 +151,27 @@ def _is_below(model: mujoco.MjModel, body: int, top: int) -> bool:
     while body > top:
         body = model.body_parentid[body]
     return body == top
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene in many configurations, ours and C's contacts; `slot` says in which slot each of ours is."""
+
+    model: mujoco.MjModel
+    qpos: np.ndarray
+    hand: HandObject
+    grasps: HandGrasps
+    ours: Found
+    slot: np.ndarray
+    theirs: Found
+
+
+@cache
+def case(scene: str, name: str) -> Case:
+    """Computed once a process."""
+    model = model_of(scene, name)
+    qpos = near_contact(model, COUNT, seed=1)
+    hand = HandObject.from_mjcf(model, "object", contact_distance=0.0, max_contacts=SLOTS)
+    grasps = jax.tree.map(np.asarray, hand.grasps(qpos))
+    slot = np.nonzero(np.isfinite(grasps.distances))[1]
+    return Case(model, qpos, hand, grasps, ours(grasps), slot, by_mujoco(model, qpos))
