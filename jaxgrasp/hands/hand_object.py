@@ -78,9 +78,11 @@ class HandObject:
             ValueError: The scene cannot be read, there is no such body, the object or a joint of the hand is of a kind
                 that is not covered, or a pair of geoms can touch whose distance is not known.
         """
-        for name, value in (("contact_distance", contact_distance), ("max_force", max_force)):
-            if not np.isfinite(value) or value < 0 or (name == "max_force" and value == 0):
-                raise ValueError(f"{name}: got {value}, wanted a finite positive number")
+        if not (np.isfinite(max_force) and max_force > 0):
+            raise ValueError(f"max_force: got {max_force}, wanted a finite positive number")
+        for name, value in (("contact_distance", contact_distance), ("friction", friction), ("merge", merge)):
+            if value is not None and not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}: got {value}, wanted a finite number, at least 0")
         if max_contacts < 1:
             raise ValueError(f"max_contacts: got {max_contacts}, wanted at least 1")
         model = _read(scene)
