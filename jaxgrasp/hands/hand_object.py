@@ -19,7 +19,7 @@ from jaxgrasp.hands.actuators import Actuators, read_actuators
 from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.grasps import HandGrasps
 from jaxgrasp.hands.kinematics import FREE, HINGE, SLIDE, Kinematics, Poses, matrices, place
-from jaxgrasp.hands.tendons import spatial_lengths
+from jaxgrasp.hands.tendons import spatial_transmission
 from jaxgrasp.hands.touching import PairTable, Points, pair_table, touching_points
 
 # Quaternions are normalised; farther from 1 than this they are taken for a mistake.
@@ -338,13 +338,8 @@ class HandObject:
             rest = jnp.asarray(self.model.qpos0[self.model.jnt_qposadr[self.joints]], qpos.dtype)
             return start + (joints - rest) @ jnp.asarray(constant, qpos.dtype), constant
 
-        lengths = spatial_lengths(self.model)
-
-        def of_joints(qpos: jax.Array, joints: jax.Array) -> jax.Array:
-            return lengths(qpos.at[self.model.jnt_qposadr[self.joints]].set(joints))[numbers]
-
-        arms = jax.vmap(jax.jacfwd(of_joints, argnums=1))(qpos, joints)
-        return jax.vmap(of_joints)(qpos, joints), jnp.swapaxes(arms, -1, -2)
+        lengths, moments = jax.vmap(spatial_transmission(self.model))(qpos)
+        return lengths[:, numbers], jnp.swapaxes(moments[:, numbers][:, :, self.dofs], -1, -2)
 
 
 def _read(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
