@@ -13,12 +13,12 @@ FINGER = f"""
   <site name="s0" pos="0.01 0.012 0"/>
   <body name="l2" pos="0.04 0 0">
     <joint name="b" axis="0 1 0" ref="0.1" stiffness="0.3"/>
-    <geom {TIP} pos="0 -0.05 0"/>
+    <geom {TIP} pos="0.045 -0.02 0"/>
     <geom name="pulley" type="cylinder" size="0.006 0.02" euler="1.5708 0 0" contype="0" conaffinity="0"/>
     <site name="s1" pos="0.015 0.01 0.008"/>
     <body name="l3" pos="0.03 0 0">
       <joint name="c" axis="1 2 0.5" pos="0.001 0 0.002"/>
-      <geom {TIP} pos="0 0.05 0"/>
+      <geom {TIP} pos="0.02 0.02 0"/>
       <site name="s2" pos="0.012 0 0.009"/>
       <body name="l4" pos="0.01 0 0">
         <joint name="d" type="slide" axis="1 0 0.2" stiffness="2"/>
