@@ -284,3 +284,51 @@ def required_wrench(mass, gravity, inertia, twist, acceleration) -> np.ndarray:
     linear, angular = np.split(np.asarray(acceleration), 2)
     force = mass * (linear + np.cross(w, v) - np.asarray(gravity))
     return np.concatenate([force, inertia @ angular + np.cross(w, inertia @ w)])
+
+
+def actuated_rows(
+    G: np.ndarray,
+    friction: np.ndarray,
+    max_force: np.ndarray,
+    actuation: dict[str, np.ndarray],
+    wrenches: np.ndarray,
+    load: np.ndarray,
+    compliance: np.ndarray | None = None,
+    edges: int = 8,
+) -> tuple[np.ndarray, ...]:
+    """(21) of one grasp and its actuators over (f, u, lambda), every row written out: A x <= h, B x = c.
+
+    `actuation` has jacobian (n_c, 3, n_v), transmission (n_v, n_u), lower and upper (n_u,).
+    """
+    n_c, joints = len(friction), actuation["jacobian"].shape[-1]
+    J, B = actuation["jacobian"].reshape(3 * n_c, joints), actuation["transmission"]
+    count = B.shape[1]
+    left, values, _ = np.linalg.svd(B)
+    unreached = left[:, np.sum(values > RANK_TOLERANCE * values[0]) :]
+    stacked = np.vstack([G, unreached.T @ J.T])
+    root = np.linalg.cholesky(compliance_matrix(compliance, n_c))
+    star = np.linalg.solve(root.T, np.linalg.pinv(np.linalg.solve(root, stacked.T).T, RANK_TOLERANCE))[:, :6]
+    force = -wrenches @ star.T
+    effort = force @ J @ np.linalg.pinv(B).T
+    C = scipy.linalg.block_diag(*(facet_rows(mu, edges) for mu in friction))
+    E = np.kron(np.eye(n_c), [0.0, 0.0, 1.0])
+    worst = lambda change: np.maximum(change.max(0), 0)  # noqa: E731
+    A = np.zeros((len(C) + n_c + 2 * count, 3 * n_c + count + 1))
+    A[: len(C), : 3 * n_c], A[len(C) : len(C) + n_c, : 3 * n_c] = C, -E
+    A[-2 * count : -count, 3 * n_c : -1], A[-count:, 3 * n_c : -1] = np.eye(count), -np.eye(count)
+    A[:, -1] = np.concatenate([worst(force @ C.T), worst(-force @ E.T), worst(effort), worst(-effort)])
+    h = np.concatenate([np.zeros(len(C)), max_force, actuation["upper"], -actuation["lower"]])
+    equal = np.zeros((6 + joints, A.shape[1]))
+    equal[:6, : 3 * n_c], equal[6:, : 3 * n_c], equal[6:, 3 * n_c : -1] = G, J.T, -B
+    return A, h, equal, np.concatenate([load, np.zeros(joints)])
+
+
+def largest_actuated(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray) -> float:
+    """The largest last unknown by HiGHS; nan where there is none."""
+    cost = np.append(np.zeros(A.shape[1] - 1), -1.0)
+    # Torques and moments are small numbers; joints that neither contacts nor actuators reach have rows of zeros.
+    size = np.abs(equal).max(1)
+    size[size == 0] = 1.0
+    options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    result = linprog(cost, A, h, equal / size[:, None], c / size, (None, None), "highs", options=options)
+    return -result.fun if result.status == 0 else np.nan

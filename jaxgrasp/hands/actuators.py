@@ -64,21 +64,10 @@ def read_actuators(model: mujoco.MjModel, dofs: np.ndarray) -> Actuators:
             else than joints and tendons, or with a limit that this cannot express.
     """
     moment = _moments(model)
-    numbers, constant = [], True
-    for a in range(model.nu):
-        kind = mujoco.mjtTrn(model.actuator_trntype[a])
-        if kind in _JOINTS:
-            moves = model.jnt_dofadr[model.actuator_trnid[a, 0]] in dofs
-        elif kind == mujoco.mjtTrn.mjTRN_TENDON:
-            moves = bool(np.any(moment[a, dofs]))
-            constant &= not moves or _is_fixed(model, model.actuator_trnid[a, 0])
-        else:
-            raise ValueError(
-                f"scene: actuator {_name(model, a)} acts by {kind.name[6:].lower()}; wanted joint or tendon"
-            )
-        if moves:
-            numbers.append(a)
-    numbers = np.array(numbers, int)
+    acts = np.array([_acts_on(model, a, moment[a]) for a in range(model.nu)]).reshape(model.nu, model.nv)
+    numbers = np.flatnonzero(acts[:, dofs].any(-1))
+    on_tendon = model.actuator_trntype[numbers] == int(mujoco.mjtTrn.mjTRN_TENDON)
+    constant = all(_is_fixed(model, t) for t in model.actuator_trnid[numbers[on_tendon], 0])
     affine = np.array([_affine(model, a) for a in numbers]).reshape(-1, 3)
     unlimited = np.array([-np.inf, np.inf])
     limited = lambda flags, ranges: np.where(flags[numbers, None], ranges[numbers], unlimited)  # noqa: E731
@@ -93,7 +82,7 @@ def read_actuators(model: mujoco.MjModel, dofs: np.ndarray) -> Actuators:
         bias=affine[:, 1],
         slope=affine[:, 2],
         command=command,
-        force=_joint_limits(model, dofs, numbers, moment, force),
+        force=_tendon_limits(model, numbers, _joint_limits(model, dofs, numbers, moment, acts, force)),
         transmission=moment[np.ix_(numbers, dofs)].T if constant else None,
     )
 
@@ -125,13 +114,48 @@ def _moments(model: mujoco.MjModel) -> np.ndarray:
     return moment
 
 
+def _acts_on(model: mujoco.MjModel, a: int, moment: np.ndarray) -> np.ndarray:
+    """Which degrees of freedom (nv,) an actuator acts on in some configuration, given its moments in one."""
+    kind = mujoco.mjtTrn(model.actuator_trntype[a])
+    if kind in _JOINTS:
+        return moment != 0
+    if kind != mujoco.mjtTrn.mjTRN_TENDON:
+        raise ValueError(f"scene: actuator {_name(model, a)} acts by {kind.name[6:].lower()}; wanted joint or tendon")
+    tendon = model.actuator_trnid[a, 0]
+    if _is_fixed(model, tendon):
+        return moment != 0
+    # A tendon that happens to cross a joint's axis has no moment there; elsewhere it has.
+    path = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+    bodies = {
+        int((model.site_bodyid if kind == int(mujoco.mjtWrap.mjWRAP_SITE) else model.geom_bodyid)[number])
+        for kind, number in zip(model.wrap_type[path], model.wrap_objid[path], strict=True)
+        if kind != int(mujoco.mjtWrap.mjWRAP_PULLEY)
+    }
+    moved = np.array([_moved_by(model, body) for body in bodies])
+    return moved.any(0) & ~moved.all(0)
+
+
+def _moved_by(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """The degrees of freedom (nv,) that move a body."""
+    moved = np.zeros(model.nv, bool)
+    while body:
+        moved |= model.dof_bodyid == body
+        body = int(model.body_parentid[body])
+    return moved
+
+
 def _is_fixed(model: mujoco.MjModel, tendon: int) -> bool:
     first = model.tendon_adr[tendon]
     return bool(np.all(model.wrap_type[first : first + model.tendon_num[tendon]] == int(mujoco.mjtWrap.mjWRAP_JOINT)))
 
 
 def _joint_limits(
-    model: mujoco.MjModel, dofs: np.ndarray, numbers: np.ndarray, moment: np.ndarray, force: np.ndarray
+    model: mujoco.MjModel,
+    dofs: np.ndarray,
+    numbers: np.ndarray,
+    moment: np.ndarray,
+    acts: np.ndarray,
+    force: np.ndarray,
 ) -> np.ndarray:
     """Force ranges within the limits of the joints' own (`actuatorfrcrange`)."""
     force = force.copy()
@@ -139,14 +163,33 @@ def _joint_limits(
         dof = model.jnt_dofadr[joint]
         if dof not in dofs:
             continue
-        rows = np.flatnonzero(moment[numbers, dof])
-        if len(rows) != 1 or np.count_nonzero(moment[numbers[rows[0]]]) != 1:
+        rows = np.flatnonzero(acts[numbers, dof])
+        if not len(rows):
+            continue
+        if len(rows) != 1 or np.count_nonzero(acts[numbers[rows[0]]]) != 1:
             raise ValueError(
                 f"scene: joint {model.joint(joint).name!r} limits the sum of its actuators' forces; wanted limits of "
                 "the actuators themselves (forcerange) where these act on several joints or together"
             )
         ends = np.sort(model.jnt_actfrcrange[joint] / moment[numbers[rows[0]], dof])
         force[rows[0]] = np.clip(force[rows[0]], *ends)
+    return force
+
+
+def _tendon_limits(model: mujoco.MjModel, numbers: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Force ranges within the limits of the tendons' own (`actuatorfrcrange`)."""
+    force = force.copy()
+    pulled = np.where(
+        model.actuator_trntype[numbers] == int(mujoco.mjtTrn.mjTRN_TENDON), model.actuator_trnid[numbers, 0], -1
+    )
+    for tendon in np.flatnonzero(model.tendon_actfrclimited):
+        rows = np.flatnonzero(pulled == tendon)
+        if len(rows) > 1:
+            raise ValueError(
+                f"scene: tendon {model.tendon(tendon).name!r} limits the sum of its actuators' forces; wanted limits "
+                "of the actuators themselves (forcerange)"
+            )
+        force[rows] = np.clip(force[rows], *model.tendon_actfrcrange[tendon])
     return force
 
 

@@ -59,7 +59,7 @@ def read_couplings(model: mujoco.MjModel, dofs: np.ndarray) -> Couplings:
     """
     place = {int(dof): i for i, dof in enumerate(dofs)}
     found = []
-    for e in np.flatnonzero(model.eq_active0):
+    for e in np.flatnonzero(model.eq_active0).tolist():
         kind = mujoco.mjtEq(model.eq_type[e])
         if kind == mujoco.mjtEq.mjEQ_JOINT:
             follower, leader = (int(j) for j in (model.eq_obj1id[e], model.eq_obj2id[e]))

@@ -19,7 +19,7 @@ from jaxgrasp.hands.actuators import Actuators, read_actuators
 from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.grasps import HandGrasps
 from jaxgrasp.hands.kinematics import FREE, HINGE, SLIDE, Kinematics, Poses, matrices, place
-from jaxgrasp.hands.tendons import spatial_lengths
+from jaxgrasp.hands.tendons import spatial_transmission
 from jaxgrasp.hands.touching import PairTable, Points, pair_table, touching_points
 
 # Quaternions are normalised; farther from 1 than this they are taken for a mistake.
@@ -78,9 +78,11 @@ class HandObject:
             ValueError: The scene cannot be read, there is no such body, the object or a joint of the hand is of a kind
                 that is not covered, or a pair of geoms can touch whose distance is not known.
         """
-        for name, value in (("contact_distance", contact_distance), ("max_force", max_force)):
-            if not np.isfinite(value) or value < 0 or (name == "max_force" and value == 0):
-                raise ValueError(f"{name}: got {value}, wanted a finite positive number")
+        if not (np.isfinite(max_force) and max_force > 0):
+            raise ValueError(f"max_force: got {max_force}, wanted a finite positive number")
+        for name, value in (("contact_distance", contact_distance), ("friction", friction), ("merge", merge)):
+            if value is not None and not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}: got {value}, wanted a finite number, at least 0")
         if max_contacts < 1:
             raise ValueError(f"max_contacts: got {max_contacts}, wanted at least 1")
         model = _read(scene)
@@ -379,13 +381,8 @@ class HandObject:
             rest = jnp.asarray(self.model.qpos0[self.model.jnt_qposadr[self.joints]], qpos.dtype)
             return start + (joints - rest) @ jnp.asarray(constant, qpos.dtype), constant
 
-        lengths = spatial_lengths(self.model)
-
-        def of_joints(qpos: jax.Array, joints: jax.Array) -> jax.Array:
-            return lengths(qpos.at[self.model.jnt_qposadr[self.joints]].set(joints))[numbers]
-
-        arms = jax.vmap(jax.jacfwd(of_joints, argnums=1))(qpos, joints)
-        return jax.vmap(of_joints)(qpos, joints), jnp.swapaxes(arms, -1, -2)
+        lengths, moments = jax.vmap(spatial_transmission(self.model))(qpos)
+        return lengths[:, numbers], jnp.swapaxes(moments[:, numbers][:, :, self.dofs], -1, -2)
 
 
 def _read(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:

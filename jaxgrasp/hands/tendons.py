@@ -1,4 +1,4 @@
-"""Lengths of actuators that act by way of tendons over sites and wrapping geoms, by MJX."""
+"""Lengths and moments of actuators that act by way of tendons over sites and wrapping geoms, by MJX."""
 
 import contextlib
 import copy
@@ -9,8 +9,8 @@ import jax
 import mujoco
 
 
-def spatial_lengths(model: mujoco.MjModel) -> Callable[[jax.Array], jax.Array]:
-    """Lengths (nu,) of all actuators as a function of the configuration (nq,).
+def spatial_transmission(model: mujoco.MjModel) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
+    """Lengths (nu,) and moments (nu, nv) of all actuators as a function of the configuration (nq,).
 
     Raises:
         ValueError: MJX does not know something in the model.
@@ -23,7 +23,7 @@ def spatial_lengths(model: mujoco.MjModel) -> Callable[[jax.Array], jax.Array]:
     model = copy.copy(model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
-    def lengths(qpos: jax.Array) -> jax.Array:
+    def transmission(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         # MJX mixes precisions and ranks at will. The model takes the precision that JAX has while tracing.
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             try:
@@ -33,6 +33,7 @@ def spatial_lengths(model: mujoco.MjModel) -> Callable[[jax.Array], jax.Array]:
             except NotImplementedError as error:
                 raise ValueError(f"scene: MJX cannot represent it: {error}") from error
             found = mjx.com_pos(on_device, mjx.kinematics(on_device, data.replace(qpos=qpos)))
-            return mjx.transmission(on_device, mjx.tendon(on_device, found)).actuator_length
+            found = mjx.transmission(on_device, mjx.tendon(on_device, found))
+            return found.actuator_length, found._impl.actuator_moment
 
-    return lengths
+    return transmission

@@ -1,0 +1,106 @@
+"""Contacts, grasp maps and Jacobians from configurations of hands, against C MuJoCo."""
+
+from __future__ import annotations
+
+import hand_configurations as configurations
+import jax
+import mujoco
+import numpy as np
+import pytest
+from hand_configurations import case
+
+import jaxgrasp as jg
+from jaxgrasp.hands import HandObject
+
+# What closed forms, or a search that ends at corners and edges, find is the same in C to rounding; m, and of normals.
+EXACT = 1e-6
+# Around smooth shapes C's search ends at its own tolerance: 1e-12 m of the distance leave 1e-6 of a normal's direction
+# where the radius of curvature is 1 m, and 1e-5 of it where it is 10 mm.
+SMOOTH = 5e-5
+SMOOTH_KINDS = ("ellipsoid", "cylinder")
+# Of smooth shapes and of meshes that penetrate, C and we find the same point in at least this share of contacts.
+SHARE = 0.995
+WRENCH = 1e-9
+
+thorough = pytest.mark.thorough
+CASES = [
+    ("four_fingers", "sphere"),
+    ("four_fingers", "box"),
+    ("four_fingers", "ellipsoid"),
+    ("shadow_hand", "sphere"),
+    *[pytest.param("four_fingers", name, marks=thorough) for name in ("capsule", "cylinder", "mesh")],
+    *[pytest.param("shadow_hand", name, marks=thorough) for name in ("box", "mesh")],
+]
+
+
+@pytest.mark.parametrize("scene, name", CASES)
+def test_contacts_are_those_of_mujoco(scene, name):
+    ours, theirs = case(scene, name).ours, case(scene, name).theirs
+    near = ours.distance < configurations.MARGIN
+    smooth = np.array([any(kind in SMOOTH_KINDS for kind in kinds.split("-")) for kinds in theirs.kinds])
+    for of, among, counted in ((theirs, ours, slice(None)), (ours, theirs, near)):
+        position, normal, distance, at = configurations.differences(of, among)
+        loose = (smooth if of is theirs else smooth[at])[counted]
+        position, normal, distance = position[counted], normal[counted], distance[counted]
+        wrong = (distance > EXACT) | (position > EXACT) | (normal > np.where(loose, SMOOTH, EXACT))
+        print(f"{scene} {name}: {len(wrong)} contacts, {wrong.sum()} differ")
+        print(np.c_[position, normal, distance][wrong][:10])
+        assert len(wrong) > 2000
+        assert np.mean(~wrong) >= SHARE
+        if name in ("sphere", "capsule", "box") and scene == "four_fingers":
+            assert not wrong.any()
+    at = configurations.differences(theirs, ours)[-1]
+    assert np.array_equal(theirs.friction, ours.friction[at])
+    grasps = case(scene, name).grasps
+    assert np.array_equal(grasps.touching, np.bincount(ours.lane[ours.distance <= 0], minlength=configurations.COUNT))
+    assert np.array_equal(grasps.contacts.active, grasps.distances <= 0)
+    assert np.all(np.diff(grasps.distances, axis=-1)[np.isfinite(grasps.distances[:, 1:])] >= 0)
+
+
+@pytest.mark.parametrize("scene, name", [("four_fingers", "box"), ("shadow_hand", "sphere")])
+def test_wrenches_and_torques_of_contact_forces(scene, name):
+    this = case(scene, name)
+    model, theirs = this.model, this.theirs
+    at = configurations.differences(theirs, this.ours)[-1]
+    # C's points on meshes are to 1e-7 m alone.
+    usable = (theirs.distance < 0) & ~np.char.find(theirs.kinds, "mesh").astype(bool)
+    usable = (theirs.distance < 0) & (np.char.find(theirs.kinds, "mesh") < 0)
+    rng = np.random.default_rng(3)
+    forces = np.zeros((*this.grasps.distances.shape, 3))
+    wrench = np.zeros((len(forces), 6))
+    torque = np.zeros((len(forces), len(this.hand.dofs)))
+    data = mujoco.MjData(model)
+    body = model.body("object").id
+    free = model.jnt_dofadr[model.body("object").jntadr[0]] + np.arange(6)
+    lanes = np.unique(theirs.lane[usable])[:200]
+    for lane in lanes:
+        data.qpos = this.qpos[lane]
+        mujoco.mj_fwdPosition(model, data)
+        rotation, centre = data.xmat[body].reshape(3, 3), data.subtree_com[body]
+        for i in np.flatnonzero(usable & (theirs.lane == lane)):
+            slot = this.slot[at[i]]
+            if forces[lane, slot].any():
+                continue
+            force = rng.normal(size=3)
+            point = rotation @ theirs.position[i] + centre
+            forces[lane, slot] = this.grasps.contacts.frames[lane, slot].T @ rotation.T @ force
+            moving = np.zeros((3, model.nv))
+            mujoco.mj_jac(model, data, moving, None, point, theirs.link[i])
+            torque[lane] += (moving.T @ force)[this.hand.dofs]
+            mujoco.mj_jac(model, data, moving, None, point, body)
+            generalized = (moving.T @ force)[free]
+            # About the body's origin, in the body's frame already.
+            pushed = rotation.T @ generalized[:3]
+            wrench[lane] += np.r_[pushed, generalized[3:] - np.cross(model.body_ipos[body], pushed)]
+    assert len(lanes) == 200 and np.count_nonzero(forces.any(-1)) > 500
+    found = np.einsum("nwi,ni->nw", jg.grasp_map(this.grasps.contacts), forces.reshape(len(forces), -1))
+    np.testing.assert_allclose(found, wrench, atol=WRENCH)
+    np.testing.assert_allclose(this.grasps.actuation.joint_torques(forces), torque, atol=WRENCH)
+    points, world = this.grasps.in_world_frame(forces)
+    np.testing.assert_allclose(
+        world.sum(1), np.einsum("nij,nj->ni", this.grasps.object_rotation, wrench[:, :3]), atol=WRENCH
+    )
+    moments = np.cross(points - this.grasps.object_position[:, None], world).sum(1)
+    np.testing.assert_allclose(
+        moments, np.einsum("nij,nj->ni", this.grasps.object_rotation, wrench[:, 3:]), atol=WRENCH
+    )
