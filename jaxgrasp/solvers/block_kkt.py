@@ -26,7 +26,7 @@ from jaxgrasp.fence import each, fenced, repeat
 
 Rows = tuple[jax.Array, ...]
 # Matrices of the equality rows up to this size are factored as they are.
-_UNDIVIDED = 8
+_UNDIVIDED = 16
 
 
 class Blocks(NamedTuple):
