@@ -162,7 +162,8 @@ class HandObject:
         """Commands with which the actuators exert the efforts while the hand rests in the grasps' configurations.
 
         A position servo is sent beyond where it is, to squeeze. The limits of commands are not applied here: they are
-        part of the limits of `HandGrasps.actuation`.
+        part of the limits of `HandGrasps.actuation`. Nor is the hand's own weight, which J'f = B u leaves out: where it
+        counts, give `gravcomp` to the hand's bodies, or add to the efforts what `qfrc_bias` needs of each actuator.
 
         Args:
             grasps: Of the configurations.
