@@ -33,7 +33,9 @@ PARTS = """
 @cache
 def composite() -> tuple[HandObject, np.ndarray]:
     model = finger(objects=PARTS)
-    return HandObject.from_mjcf(model, "object", contact_distance=0.0, max_contacts=12), random_configurations(model, COUNT)
+    return HandObject.from_mjcf(model, "object", contact_distance=0.0, max_contacts=12), random_configurations(
+        model, COUNT
+    )
 
 
 def grasps_of_parts():
@@ -114,8 +116,9 @@ def test_the_nearest_contacts_are_kept():
     whole = grasps_of_parts()
     few = jax.tree.map(
         np.asarray,
-        HandObject.from_mjcf(hand.model, "object", contact_distance=0.0, max_contacts=2, friction=0.3, max_force=7.0)
-        .grasps(qpos),
+        HandObject.from_mjcf(
+            hand.model, "object", contact_distance=0.0, max_contacts=2, friction=0.3, max_force=7.0
+        ).grasps(qpos),
     )
     assert few.distances.shape == (COUNT, 2)
     assert np.array_equal(few.distances, whole.distances[:, :2])
@@ -215,7 +218,9 @@ def test_configurations_of_another_length(shape):
 
 
 def test_hidden_moment_arms_and_limits_of_tendons_and_joints():
-    straight = FINGER.replace('pos="0.01 0.012 0"', 'pos="0.01 0 0"').replace('pos="0.015 0.01 0.008"', 'pos="0.015 0 0"')
+    straight = FINGER.replace('pos="0.01 0.012 0"', 'pos="0.01 0 0"').replace(
+        'pos="0.015 0.01 0.008"', 'pos="0.015 0 0"'
+    )
     # Straight through the axis of b, the tendon has no moment there.
     rest = (
         '<tendon><spatial name="t"><site site="s0"/><site site="s1"/></spatial></tendon>'

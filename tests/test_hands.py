@@ -63,7 +63,6 @@ def test_wrenches_and_torques_of_contact_forces(scene, name):
     model, theirs = this.model, this.theirs
     at = configurations.differences(theirs, this.ours)[-1]
     # C's points on meshes are to 1e-7 m alone.
-    usable = (theirs.distance < 0) & ~np.char.find(theirs.kinds, "mesh").astype(bool)
     usable = (theirs.distance < 0) & (np.char.find(theirs.kinds, "mesh") < 0)
     rng = np.random.default_rng(3)
     forces = np.zeros((*this.grasps.distances.shape, 3))
@@ -97,7 +96,9 @@ def test_wrenches_and_torques_of_contact_forces(scene, name):
     np.testing.assert_allclose(found, wrench, atol=WRENCH)
     np.testing.assert_allclose(this.grasps.actuation.joint_torques(forces), torque, atol=WRENCH)
     points, world = this.grasps.in_world_frame(forces)
-    np.testing.assert_allclose(world.sum(1), np.einsum("nij,nj->ni", this.grasps.object_rotation, wrench[:, :3]), atol=WRENCH)
+    np.testing.assert_allclose(
+        world.sum(1), np.einsum("nij,nj->ni", this.grasps.object_rotation, wrench[:, :3]), atol=WRENCH
+    )
     moments = np.cross(points - this.grasps.object_position[:, None], world).sum(1)
     np.testing.assert_allclose(
         moments, np.einsum("nij,nj->ni", this.grasps.object_rotation, wrench[:, 3:]), atol=WRENCH
