@@ -66,12 +66,12 @@ def test_contacts():
     check(outputs, random_configurations(model, 100), 1e-6)
 
 
-@pytest.mark.parametrize("scene", ["four_fingers", pytest.param("shadow_hand", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("scene", ["four_fingers", "shadow_hand"])
 def test_margins(scene):
     this = configurations.case(scene, "sphere")
-    links = np.array(
-        [len(set(row[:n])) for row, n in zip(this.grasps.links.tolist(), this.grasps.touching, strict=True)]
-    )
+    touched = zip(this.grasps.links.tolist(), this.grasps.touching, strict=True)
+    links = np.array([len(set(row[:count])) for row, count in touched])
     qpos = this.qpos[(links >= 3) & (this.grasps.touching <= 6)][:20]
 
     def outputs(qpos):
