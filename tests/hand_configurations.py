@@ -33,7 +33,7 @@ def model_of(scene: str, name: str) -> mujoco.MjModel:
 
 
 def near_contact(model: mujoco.MjModel, count: int, seed: int) -> np.ndarray:
-    """(count, nq): the hand closed around the object, every joint and the object's pose a little moved; some lowered."""
+    """(count, nq): the hand closed around the object, joints and object a little moved, some lowered."""
     rng = np.random.default_rng(seed)
     closed = reach(model)[0].qpos
     qpos = np.repeat(closed[None], count, 0)

@@ -88,6 +88,10 @@ def commanded(model: mujoco.MjModel, numbers: np.ndarray, qpos: np.ndarray, comm
     return data
 
 
+def moments_of(data: mujoco.MjData) -> tuple[np.ndarray, ...]:
+    return data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+
+
 @pytest.mark.parametrize("kind", ["kinds", "spatial", "shadow_hand"])
 def test_efforts_and_commands_are_those_of_mujoco(kind):
     hand, qpos, grasps = scene(kind)
@@ -103,9 +107,13 @@ def test_efforts_and_commands_are_those_of_mujoco(kind):
         B = grasps.actuation.transmission[lane]
         data = commanded(model, numbers, qpos[lane], commands[lane])
         moment = np.zeros((model.nu, model.nv))
+<<<<<<< HEAD
         mujoco.mju_sparse2dense(
             moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
         )
+=======
+        mujoco.mju_sparse2dense(moment, *moments_of(data))
+>>>>>>> hands-C
         np.testing.assert_allclose(B, moment[np.ix_(numbers, hand.dofs)].T, atol=EXACT)
         np.testing.assert_allclose(grasps.actuator_lengths[lane], data.actuator_length[numbers], atol=EXACT)
         np.testing.assert_allclose(data.actuator_force[numbers], efforts[lane], atol=EXACT)
@@ -159,7 +167,7 @@ def test_coupled_joints_move_as_in_mujoco():
         np.testing.assert_allclose(rows[:, hand.dofs] @ T, 0, atol=EXACT)
         np.testing.assert_allclose(T[1], 1)
         B = np.zeros((model.nu, model.nv))
-        mujoco.mju_sparse2dense(B, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+        mujoco.mju_sparse2dense(B, *moments_of(data))
         np.testing.assert_allclose(grasps.actuation.transmission[lane], T.T @ B[:, hand.dofs].T, atol=EXACT)
         springs = np.diag(model.jnt_stiffness[hand.joints])
         gains = B.T[hand.dofs] @ np.diag([2.0, 3.0]) @ B[:, hand.dofs]

@@ -27,13 +27,12 @@ def check(function, qpos: np.ndarray, step: float, seed: int = 0) -> None:
     """`function` maps (n, nq) to a dictionary of (n, ...)."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=qpos.shape)
-    forward = jax.jit(function)
-    value, pushed = jax.jit(lambda q, v: jax.jvp(function, (q,), (v,)))(qpos, direction)
+    # Without a jit around it all: each part is a program of its own, which is far less to compile.
+    value, pushed = jax.jvp(function, (qpos,), (direction,))
     cotangent = jax.tree.map(lambda x: rng.normal(size=x.shape), value)
-    pulled = jax.jit(lambda q, w: jax.vjp(function, q)[1](w)[0])(qpos, cotangent)
-    ends = [forward(qpos + h * direction) for h in (step, -step, step / 2, -step / 2)]
+    (pulled,) = jax.vjp(function, qpos)[1](cotangent)
+    ends = [function(qpos + h * direction) for h in (step, -step, step / 2, -step / 2)]
     both = np.zeros(len(qpos))
-    smooth = np.ones(len(qpos), bool)
     for name in value:
         flat = lambda x: np.asarray(x).reshape(len(qpos), -1)  # noqa: E731
         coarse = flat(ends[0][name] - ends[1][name]) / (2 * step)
@@ -45,7 +44,6 @@ def check(function, qpos: np.ndarray, step: float, seed: int = 0) -> None:
         assert fits.mean() >= COUNTED
         assert np.abs(fine[fits]).max() > 0.1
         assert error[fits].max() <= WORST
-        smooth &= fits
         both += np.sum(flat(pushed[name]) * flat(cotangent[name]), -1)
     reverse = np.sum(np.asarray(pulled) * direction, -1)
     np.testing.assert_allclose(reverse, both, rtol=1e-9, atol=1e-9)
@@ -65,15 +63,21 @@ def test_contacts():
             "required_wrench": grasps.required_wrench,
         }
 
-    check(outputs, random_configurations(model, 100), 1e-5)
+    check(outputs, random_configurations(model, 100), 1e-6)
 
 
-@pytest.mark.parametrize("scene", ["four_fingers", pytest.param("shadow_hand", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("scene", ["four_fingers", "shadow_hand"])
 def test_margins(scene):
     this = configurations.case(scene, "sphere")
+<<<<<<< HEAD
     links = np.array(
         [len(set(row[:n])) for row, n in zip(this.grasps.links.tolist(), this.grasps.touching, strict=True)]
     )
+=======
+    touched = zip(this.grasps.links.tolist(), this.grasps.touching, strict=True)
+    links = np.array([len(set(row[:count])) for row, count in touched])
+>>>>>>> hands-C
     qpos = this.qpos[(links >= 3) & (this.grasps.touching <= 6)][:20]
 
     def outputs(qpos):

@@ -154,7 +154,10 @@ def test_points_on_a_link_become_one():
     assert np.array_equal(merged.contacts.active, merged.distances <= 0)
 
 
-FIXED = '<tendon><fixed name="t"><joint joint="a" coef="1"/></fixed><fixed name="s"><joint joint="b" coef="1"/></fixed></tendon>'
+FIXED = (
+    '<tendon><fixed name="t"><joint joint="a" coef="1"/></fixed>'
+    '<fixed name="s"><joint joint="b" coef="1"/></fixed></tendon>'
+)
 TWO = '<motor joint="d"/><motor joint="d"/>'
 LIMITED = FINGER.replace('name="d" type="slide"', 'name="d" type="slide" actuatorfrcrange="-1 2"')
 OBJECT = hand_models.BALL
