@@ -107,13 +107,7 @@ def test_efforts_and_commands_are_those_of_mujoco(kind):
         B = grasps.actuation.transmission[lane]
         data = commanded(model, numbers, qpos[lane], commands[lane])
         moment = np.zeros((model.nu, model.nv))
-<<<<<<< HEAD
-        mujoco.mju_sparse2dense(
-            moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        )
-=======
         mujoco.mju_sparse2dense(moment, *moments_of(data))
->>>>>>> hands-C
         np.testing.assert_allclose(B, moment[np.ix_(numbers, hand.dofs)].T, atol=EXACT)
         np.testing.assert_allclose(grasps.actuator_lengths[lane], data.actuator_length[numbers], atol=EXACT)
         np.testing.assert_allclose(data.actuator_force[numbers], efforts[lane], atol=EXACT)

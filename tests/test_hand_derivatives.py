@@ -70,14 +70,8 @@ def test_contacts():
 @pytest.mark.parametrize("scene", ["four_fingers", "shadow_hand"])
 def test_margins(scene):
     this = configurations.case(scene, "sphere")
-<<<<<<< HEAD
-    links = np.array(
-        [len(set(row[:n])) for row, n in zip(this.grasps.links.tolist(), this.grasps.touching, strict=True)]
-    )
-=======
     touched = zip(this.grasps.links.tolist(), this.grasps.touching, strict=True)
     links = np.array([len(set(row[:count])) for row, count in touched])
->>>>>>> hands-C
     qpos = this.qpos[(links >= 3) & (this.grasps.touching <= 6)][:20]
 
     def outputs(qpos):
