@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import jax
 import mujoco
@@ -13,7 +13,7 @@ from test_scenes import reach
 from jaxgrasp.hands import HandGrasps, HandObject
 from jaxgrasp.hands.scenes import four_fingers, shadow_hand
 
-SCENES = {"four_fingers": four_fingers, "shadow_hand": shadow_hand}
+SCENES = {"four_fingers": four_fingers, "shadow_hand": partial(shadow_hand, coupled_tendons=True)}
 COUNT = 1000
 SLOTS = 48
 """More than any configuration fills within the margin."""

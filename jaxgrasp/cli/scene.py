@@ -53,7 +53,7 @@ class Scene:
     min_contacts: int = 2
     """Leave out configurations with fewer contacts."""
 
-    max_penetration: float = 0.005
+    max_penetration: float = 0.002
     """Leave out configurations in which hand and object are deeper in each other, m."""
 
     actuators: bool = True
