@@ -26,9 +26,7 @@ BATCH = 4096
 ROUNDS = 5
 CASES = {
     "four fingers, sphere": lambda: scenes.four_fingers("sphere"),
-    "four fingers, box": lambda: scenes.four_fingers("box"),
     "Shadow Hand, sphere": lambda: scenes.shadow_hand("sphere"),
-    "Shadow Hand, coupled tendons, sphere": lambda: scenes.shadow_hand("sphere", coupled_tendons=True),
     "Shadow Hand, box": lambda: scenes.shadow_hand("box"),
 }
 STAGES = ("kinematics", "points", "grasps", "margins", "plain margins")
@@ -54,7 +52,7 @@ def measure(hand: HandObject) -> dict:
     poses = lambda q: jax.tree.map(lambda x: x.sum(tuple(range(x.ndim - 1))), hand._kinematics.poses(q.T))  # noqa: E731
     stages = {
         "kinematics": (spread(poses), qpos),
-        "points": (spread(lambda q: hand.approach(q)[0]), qpos),
+        "points": (spread(lambda q: hand.approach(q)[0].distance), qpos),
         "grasps": (spread(hand.grasps), qpos),
     }
     grasps = stages["grasps"][0](qpos)

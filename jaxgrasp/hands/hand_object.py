@@ -24,6 +24,8 @@ from jaxgrasp.hands.touching import PairTable, Points, pair_table, touching_poin
 
 # Quaternions are normalised; farther from 1 than this they are taken for a mistake.
 _QUATERNION_TOLERANCE = 1e-3
+# Configurations at a time on CPUs.
+_TILE = 512
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -233,7 +235,17 @@ class HandObject:
 
     @cached_property
     def _compiled(self):
-        return compiled(self._grasps)
+        return compiled(self._in_tiles)
+
+    def _in_tiles(self, qpos: jax.Array) -> HandGrasps:
+        """On CPUs, tiles that stay in the cache; and searches among their lanes do not wait for the slowest of all."""
+        count = len(qpos)
+        if count <= _TILE or jax.default_backend() != "cpu":
+            return self._grasps(qpos)
+        tiles = -(-count // _TILE)
+        padded = jnp.pad(qpos, [(0, tiles * _TILE - count), (0, 0)], mode="edge")
+        found = lax.map(self._grasps, padded.reshape(tiles, _TILE, -1))
+        return jax.tree.map(lambda x: x.reshape(tiles * _TILE, *x.shape[2:])[:count], found)
 
     def _grasps(self, qpos: jax.Array) -> HandGrasps:
         """For (n, nq)."""

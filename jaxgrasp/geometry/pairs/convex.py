@@ -20,7 +20,7 @@ from jax import Array, lax
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.geom import Body, Point
-from jaxgrasp.geometry.pairs.search import Simplex, search
+from jaxgrasp.geometry.pairs.search import Simplex, search, supports
 from jaxgrasp.geometry.pairs.supports import is_smooth, radius, roundness
 from jaxgrasp.geometry.pairs.vectors import (
     Rotation,
@@ -56,7 +56,21 @@ def convex(kind_a: str, kind_b: str) -> Callable[[Body, Body], list[Point]]:
 def nearest(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> Point:
     """The point of two convex geoms; of lanes that are not wanted a meaningless one."""
     direction, simplex = search(kind_a, kind_b, lax.stop_gradient(a), lax.stop_gradient(b), wanted)
-    return _solve(kind_a, kind_b, a, b, direction, simplex)
+    solved = _solve(kind_a, kind_b, a, b, direction, simplex)
+    # Corners that the search took for others give a direction along which the geoms are not as far apart as it says.
+    found, true = (_along(kind_a, kind_b, a, b, lax.stop_gradient(d)) for d in (direction, solved.normal))
+    limit = _TOLERANCE[direction.x.dtype] * (jnp.abs(found.distance) + 1e-3)
+    sound = (jnp.abs(true.distance - solved.distance) <= limit) & (true.distance >= found.distance - limit)
+    return choose(sound, solved, found)
+
+
+def _along(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector) -> Point:
+    """The point of the farthest corners along a fixed direction."""
+    between = supports(kind_a, kind_b, a, b, d)
+    own_a, own_b = radius(kind_a, a), radius(kind_b, b)
+    separation = dot(d, between.point)
+    point = a.position + between.of_a + d * (0.5 * (separation + own_a - own_b))
+    return Point(point, d, separation - own_a - own_b)
 
 
 class _Side(NamedTuple):

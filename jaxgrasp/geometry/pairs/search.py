@@ -31,14 +31,16 @@ from jaxgrasp.geometry.pairs.vectors import (
 )
 
 # Directions tried, and points tried for each.
-_CLIMBS = 40
+_CLIMBS = 64
 _ROUNDS = 48
 # A convex set's nearest point is found to this, relative to its squared distance.
 _GAP = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-5}
 # The climb ends where it gains less than this share of the separation.
 _GAIN = 1e-3
-# Inside each other, the maxima next to the one found are tried from these directions aside (tangents of the angles).
+# Inside each other, the maxima next to the one found are tried from these directions aside (tangents of the angles),
+# and those at the axes of geoms with flat faces, which of boxes are the faces' normals.
 _TILTS = ((0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))
+_FLAT = ("box", "cylinder", "mesh")
 # Geoms inside each other are moved apart by this share of (their depth + 1 cm).
 _SLACK = 1e-2
 
@@ -49,6 +51,7 @@ class Corners(NamedTuple):
     point: Vector  # common frame
     a: Vector  # a's corner, a's frame
     b: Vector  # b's corner, b's frame
+    of_a: Vector  # a's point less a's position, common frame
 
 
 class Simplex(NamedTuple):
@@ -81,7 +84,7 @@ def search(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> tuple[V
     zero = zeros(length)
 
     def support(d: Vector) -> Corners:
-        return _support(kind_a, kind_b, a, b, d)
+        return supports(kind_a, kind_b, a, b, d)
 
     def climb(state: _State) -> _State:
         d = state.d
@@ -97,32 +100,48 @@ def search(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> tuple[V
         best = choose(better, (after, toward, found), state.best)
         on_top = after - here <= _GAIN * (jnp.abs(here) + 1e-6)
         attempt = jnp.where(on_top, state.attempt + 1, state.attempt)
-        done = state.done | (here > 0) | (attempt > len(_TILTS))
-        return _State(state.steps + 1, attempt, choose(on_top, _tilted(best[1], attempt), toward), best, done)
+        done = state.done | (here > 0) | (attempt > len(_TILTS) + len(faces))
+        return _State(state.steps + 1, attempt, choose(on_top, _start(best[1], faces, attempt), toward), best, done)
 
-    empty = Corners(zero, zero, zero)
+    empty = Corners(zero, zero, zero, zero)
     simplex = Simplex((empty, empty, empty), (zero.x, zero.x, zero.x))
     d = choose(length > 0, unit(start), axis(2, length))
+    faces = [
+        body.rotation[k] * jnp.where(dot(body.rotation[k], d) < 0, -1.0, 1.0).astype(length.dtype)
+        for kind, body in ((kind_a, a), (kind_b, b))
+        if kind in _FLAT
+        for k in range(3)
+    ]
+    d = _best_of([d, *faces], support)
     none = jnp.zeros(length.shape, jnp.int32)
     state = _State(none.sum(), none, d, (jnp.full_like(length, -jnp.inf), d, simplex), ~wanted)
     state = lax.while_loop(lambda state: (state.steps < _CLIMBS) & ~jnp.all(state.done), climb, state)
     return state.best[1], state.best[2]
 
 
-def _tilted(d: Vector, attempt: Array) -> Vector:
-    """The start of an attempt, aside of the best direction so far."""
+def _best_of(directions: list[Vector], support: Support) -> Vector:
+    """The one with the largest separation."""
+    best, most = directions[0], dot(directions[0], support(directions[0]).point)
+    for other in directions[1:]:
+        value = dot(other, support(other).point)
+        best, most = choose(value > most, (other, value), (best, most))
+    return best
+
+
+def _start(d: Vector, faces: list[Vector], attempt: Array) -> Vector:
+    """The start of an attempt: aside of the best direction so far, then the normals of faces."""
     one = unit(cross(d, least_along(d)))
     two = cross(d, one)
-    return unit(pick([d, *(d + one * x + two * y for x, y in _TILTS)], attempt))
+    return unit(pick([d, *(d + one * x + two * y for x, y in _TILTS), *faces], attempt))
 
 
-def _support(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector) -> Corners:
+def supports(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector) -> Corners:
     """The least of b - a along d."""
     toward_a, toward_b = unrotate(a.rotation, d), unrotate(b.rotation, -d)
     corner_a, corner_b = corner(kind_a, a, toward_a), corner(kind_b, b, toward_b)
     point_a = rotate(a.rotation, corner_a + bulge(kind_a, a, toward_a))
     point_b = rotate(b.rotation, corner_b + bulge(kind_b, b, toward_b))
-    return Corners(b.position - a.position + point_b - point_a, corner_a, corner_b)
+    return Corners(b.position - a.position + point_b - point_a, corner_a, corner_b, point_a)
 
 
 def _combined(simplex: Simplex) -> Vector:
@@ -133,7 +152,7 @@ def _combined(simplex: Simplex) -> Vector:
 def _nearest(support: Support, first: Corners, shift: Vector) -> Simplex:
     """The simplex that holds the nearest of all points b - a + shift, which must not hold the origin."""
     zero = zeros(shift.x)
-    empty = Corners(zero, zero, zero)
+    empty = Corners(zero, zero, zero, zero)
     moved = first._replace(point=first.point + shift)
     start = Simplex((moved, empty, empty), (jnp.ones_like(shift.x), zero.x, zero.x))
     dtype = shift.x.dtype
