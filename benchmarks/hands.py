@@ -63,7 +63,12 @@ def measure(hand: HandObject) -> dict:
         start = time.perf_counter()
         jax.block_until_ready(function(data))
         first[name] = time.perf_counter() - start
-    jobs = {name: lambda f=f, d=d: jax.block_until_ready(f(d)) and None for name, (f, d) in stages.items()}
+
+    def job(name):
+        function, data = stages[name]
+        jax.block_until_ready(function(data))
+
+    jobs = {name: lambda name=name: job(name) for name in stages}
     timings = by_turns(jobs, ROUNDS)
     margin, status = (np.asarray(x) for x in stages["margins"][0](grasps))
     return {

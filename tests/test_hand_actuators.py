@@ -217,6 +217,7 @@ def held(scene: str) -> tuple[jg.Contacts, jg.Actuation, jax.Array]:
 margins = jax.jit(lambda c, a, w: jg.largest_disturbance(c, PUSHES, actuation=a, required_wrench=w))
 
 
+@pytest.mark.thorough
 def test_margins_of_coupled_fingers_against_highs():
     contacts, actuation, weight = held("shadow_hand")
     found = margins(contacts, actuation, weight)

@@ -155,6 +155,9 @@ RARE = {
     ("capsule", "cylinder"),
     ("capsule", "mesh"),
     ("cylinder", "mesh"),
+    ("cylinder", "box"),
+    ("ellipsoid", "box"),
+    ("mesh", "mesh"),
 }
 
 

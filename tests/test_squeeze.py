@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -23,6 +24,7 @@ REST = 0.02
 SAMPLES, BEST = 64, 12
 
 
+@pytest.mark.thorough
 def test_a_simulated_hand_squeezes_as_told():
     hand = HandObject.from_mjcf(four_fingers("sphere"), "object")
     qpos = sample_configurations(hand, SAMPLES)
