@@ -27,7 +27,6 @@ ROUNDS = 5
 CASES = {
     "four fingers, sphere": lambda: scenes.four_fingers("sphere"),
     "Shadow Hand, sphere": lambda: scenes.shadow_hand("sphere"),
-    "Shadow Hand, box": lambda: scenes.shadow_hand("box"),
 }
 STAGES = ("kinematics", "points", "grasps", "margins", "plain margins")
 

@@ -16,6 +16,7 @@ from jaxgrasp.arrays import as_float, safe_divide, safe_norm
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts, required_wrench
 from jaxgrasp.hands.actuators import Actuators, read_actuators
+from jaxgrasp.hands.bodies import bodies_below, body_named, read_model
 from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.grasps import HandGrasps
 from jaxgrasp.hands.kinematics import FREE, HINGE, SLIDE, Kinematics, Poses, matrices, place
@@ -87,12 +88,16 @@ class HandObject:
                 raise ValueError(f"{name}: got {value}, wanted a finite number, at least 0")
         if max_contacts < 1:
             raise ValueError(f"max_contacts: got {max_contacts}, wanted at least 1")
-        model = _read(scene)
-        body = _body(model, "object_body", object_body)
-        of_object = _below(model, body)
+        model = read_model(scene)
+        body = body_named(model, "object_body", object_body)
+        of_object = bodies_below(model, body)
         if np.any(model.body_jntnum[of_object[1:]]):
             raise ValueError(f"object_body: got {object_body!r}, with joints inside; wanted a rigid object")
-        hand = np.arange(1, model.nbody) if hand_body is None else _below(model, _body(model, "hand_body", hand_body))
+        hand = (
+            np.arange(1, model.nbody)
+            if hand_body is None
+            else bodies_below(model, body_named(model, "hand_body", hand_body))
+        )
         hand = np.setdiff1d(hand, of_object)
         joints = np.flatnonzero(np.isin(model.jnt_bodyid, hand))
         joints = joints[np.isin(model.jnt_type[joints], (HINGE, SLIDE))]
@@ -131,7 +136,7 @@ class HandObject:
     @property
     def object_mass(self) -> float:
         """Mass of the object, kg."""
-        return float(self.model.body_mass[_below(self.model, self.object_body)].sum())
+        return float(self.model.body_mass[bodies_below(self.model, self.object_body)].sum())
 
     @property
     def constant_transmission(self) -> bool:
@@ -296,7 +301,7 @@ class HandObject:
 
     def _mass_centre(self, poses: Poses) -> jax.Array:
         """(n, 3)."""
-        bodies = _below(self.model, self.object_body)
+        bodies = bodies_below(self.model, self.object_body)
         # An object that is fixed to the world may have no mass.
         masses = np.maximum(self.model.body_mass[bodies], 1e-12)
         offsets, turns = self.model.body_ipos[bodies].T, np.repeat(np.eye(3)[..., None], len(bodies), -1)
@@ -396,30 +401,3 @@ class HandObject:
 
         lengths, moments = jax.vmap(spatial_transmission(self.model))(qpos)
         return lengths[:, numbers], jnp.swapaxes(moments[:, numbers][:, :, self.dofs], -1, -2)
-
-
-def _read(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
-    if isinstance(scene, mujoco.MjModel):
-        return scene
-    try:
-        return scene.compile() if isinstance(scene, mujoco.MjSpec) else mujoco.MjModel.from_xml_path(str(scene))
-    except ValueError as error:
-        name = "the specification" if isinstance(scene, mujoco.MjSpec) else scene
-        raise ValueError(f"scene: {name} cannot be read: {' '.join(str(error).split())}") from error
-
-
-def _body(model: mujoco.MjModel, argument: str, name: str) -> int:
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-    if body <= 0:
-        names = ", ".join(model.body(b).name for b in range(1, model.nbody) if model.body(b).name)
-        raise ValueError(f"{argument}: got {name!r}, wanted one of the scene's bodies: {names}")
-    return body
-
-
-def _below(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """A body and all bodies below it, itself first."""
-    inside = {body}
-    for other in range(body + 1, model.nbody):
-        if int(model.body_parentid[other]) in inside:
-            inside.add(other)
-    return np.array(sorted(inside))
