@@ -31,16 +31,16 @@ from jaxgrasp.geometry.pairs.vectors import (
 )
 
 # Directions tried, and points tried for each.
-_CLIMBS = 64
+_CLIMBS = 40
 _ROUNDS = 48
 # A convex set's nearest point is found to this, relative to its squared distance.
 _GAP = {jnp.dtype("float64"): 1e-8, jnp.dtype("float32"): 1e-5}
 # The climb ends where it gains less than this share of the separation.
 _GAIN = 1e-3
-# Inside each other, the maxima next to the one found are tried from these directions aside (tangents of the angles),
-# and those at the axes of geoms with flat faces, which of boxes are the faces' normals.
+# Inside each other, other maxima are sought from the normals of flat faces, or where there are none from these
+# directions aside of the one found (tangents of the angles).
 _TILTS = ((0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))
-_FLAT = ("box", "cylinder", "mesh")
+_FLAT = ("box", "cylinder")
 # Geoms inside each other are moved apart by this share of (their depth + 1 cm).
 _SLACK = 1e-2
 
@@ -100,7 +100,7 @@ def search(kind_a: str, kind_b: str, a: Body, b: Body, wanted: Array) -> tuple[V
         best = choose(better, (after, toward, found), state.best)
         on_top = after - here <= _GAIN * (jnp.abs(here) + 1e-6)
         attempt = jnp.where(on_top, state.attempt + 1, state.attempt)
-        done = state.done | (here > 0) | (attempt > len(_TILTS) + len(faces))
+        done = state.done | (here > 0) | (attempt > (len(faces) or len(_TILTS)))
         return _State(state.steps + 1, attempt, choose(on_top, _start(best[1], faces, attempt), toward), best, done)
 
     empty = Corners(zero, zero, zero, zero)
@@ -129,10 +129,12 @@ def _best_of(directions: list[Vector], support: Support) -> Vector:
 
 
 def _start(d: Vector, faces: list[Vector], attempt: Array) -> Vector:
-    """The start of an attempt: aside of the best direction so far, then the normals of faces."""
+    """The start of an attempt: the normals of faces, or aside of the best direction so far where there are none."""
+    if faces:
+        return unit(pick([d, *faces], attempt))
     one = unit(cross(d, least_along(d)))
     two = cross(d, one)
-    return unit(pick([d, *(d + one * x + two * y for x, y in _TILTS), *faces], attempt))
+    return unit(pick([d, *(d + one * x + two * y for x, y in _TILTS)], attempt))
 
 
 def supports(kind_a: str, kind_b: str, a: Body, b: Body, d: Vector) -> Corners:
