@@ -98,7 +98,7 @@ def text(results: dict[str, dict], load: float) -> str:
         parts = (s["kinematics"], s["points"] - s["kinematics"], s["grasps"] - s["points"], s["margins"])
         lines.append(
             f"| {name} | {r['pairs']} | {r['contacts']:.1f} | {r['holds']:.1%} | {r['answered']:.1%} | "
-            f"{BATCH / total:,.0f} | " + " | ".join(f"{part / total:.1%}" for part in parts) + " |"
+            f"{BATCH / total:,.0f} | " + " | ".join(f"{max(part, 0) / total:.1%}" for part in parts) + " |"
         )
     lines += [
         "",

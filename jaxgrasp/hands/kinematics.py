@@ -1,6 +1,7 @@
 """Where everything is in a configuration: forward kinematics over lanes, one level of the tree of bodies at a time.
 
-MJX has forward kinematics too; batch first and body by body, they take ten times as long to run and to compile.
+MJX has forward kinematics, too. For 1,024 configurations of the Shadow Hand they took 46 ms and 15 s of compilation,
+these 9 ms and 3 s, on a busy machine with two cores.
 """
 
 from dataclasses import dataclass
