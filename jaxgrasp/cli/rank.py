@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
 
 from jaxgrasp.cli.problems import CommandError, check_output, write_files
@@ -164,7 +165,11 @@ class Rank:
         def write_picture(path: Path) -> None:
             write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity)), path)
 
-        jobs = [(self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture)]
-        if hand is not None:
-            jobs.append((self.of_hand.picture, lambda path: self.of_hand.draw(hand, ranking, unit, path)))
-        return write_files(*jobs)
+        written, failed = write_files(
+            (self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture)
+        )
+        if hand is not None and np.isfinite(ranking.effort).any():
+            # Many machines have nothing to render with: that is told, and no failure.
+            drawn, _ = write_files((self.of_hand.picture, lambda path: self.of_hand.draw(hand, ranking, unit, path)))
+            written += drawn
+        return written, failed

@@ -183,8 +183,6 @@ class Scene:
 
         best = np.flatnonzero(np.isfinite(ranking.effort))[:_PICTURES]
         rows = ranking.order[best]
-        if not len(best):
-            raise OSError("no configuration has tightening forces")
         qpos = ranking.candidates.columns["qpos"][rows]
         points, forces = hand.grasps(qpos).in_world_frame(ranking.forces[best])
         titles = [f"#{b + 1}: margin {ranking.margin[row]:.3g} {unit}" for b, row in zip(best, rows, strict=True)]
