@@ -121,6 +121,7 @@ def test_efforts_make_the_forces_and_stay_within_limits(solved):
     assert np.all((found.actuator_efforts >= hand.lower - 1e-9)[holds])
 
 
+@pytest.mark.thorough
 def test_least_effort_is_that_of_clarabel():
     hand = HANDS["an actuator a joint"]
     margin = 0.75 * np.array([largest_actuated(*rows_of(hand, lane)) for lane in range(BATCH)])

@@ -92,7 +92,10 @@ def moments_of(data: mujoco.MjData) -> tuple[np.ndarray, ...]:
     return data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
 
 
-@pytest.mark.parametrize("kind", ["kinds", "spatial", "shadow_hand"])
+KINDS = ["kinds", "spatial", pytest.param("shadow_hand", marks=pytest.mark.thorough)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_efforts_and_commands_are_those_of_mujoco(kind):
     hand, qpos, grasps = scene(kind)
     model, numbers = hand.model, [hand.model.actuator(name).id for name in hand.actuator_names]
@@ -114,7 +117,7 @@ def test_efforts_and_commands_are_those_of_mujoco(kind):
         np.testing.assert_allclose(data.qfrc_actuator[hand.dofs], B @ efforts[lane], atol=EXACT)
 
 
-@pytest.mark.parametrize("kind", ["kinds", "spatial", "shadow_hand"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_limits_are_those_of_mujoco(kind):
     hand, qpos, grasps = scene(kind)
     model, numbers = hand.model, [hand.model.actuator(name).id for name in hand.actuator_names]
@@ -177,6 +180,7 @@ def test_coupled_joints_move_as_in_mujoco():
             )
 
 
+@pytest.mark.thorough
 def test_compliance_is_that_of_servos_and_tips():
     hand, _, grasps = scene("shadow_hand")
     found = np.asarray(hand.compliance(grasps, 2000.0))
@@ -249,6 +253,7 @@ def test_margins_of_coupled_fingers_against_highs():
     np.testing.assert_allclose(torque[counted], efforts[counted], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_limits_without_end_and_halved():
     contacts, actuation, weight = held("four_fingers")
     none = np.zeros_like(weight)

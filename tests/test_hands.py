@@ -24,7 +24,7 @@ WRENCH = 1e-9
 thorough = pytest.mark.thorough
 CASES = [
     ("four_fingers", "sphere"),
-    ("shadow_hand", "sphere"),
+    pytest.param("shadow_hand", "sphere", marks=thorough),
     *[pytest.param("four_fingers", n, marks=thorough) for n in ("capsule", "box", "ellipsoid", "cylinder", "mesh")],
     *[pytest.param("shadow_hand", n, marks=thorough) for n in ("box", "mesh")],
 ]
@@ -53,7 +53,7 @@ def test_contacts_are_those_of_mujoco(scene, name):
     assert np.all(np.diff(grasps.distances, axis=-1)[np.isfinite(grasps.distances[:, 1:])] >= 0)
 
 
-@pytest.mark.parametrize("scene, name", [("four_fingers", "sphere"), ("shadow_hand", "sphere")])
+@pytest.mark.parametrize("scene, name", CASES[:2])
 def test_wrenches_and_torques_of_contact_forces(scene, name):
     this = case(scene, name)
     model, theirs = this.model, this.theirs
