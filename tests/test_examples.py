@@ -13,7 +13,14 @@ def test_they_are_numbered():
     assert len(EXAMPLES) >= 2
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+SLOW = "03_mesh_to_grasp"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=pytest.mark.thorough) if path.stem == SLOW else path for path in EXAMPLES],
+    ids=lambda path: path.stem,
+)
 def test_example(path, tmp_path, monkeypatch, capsys):
     assert len(path.read_text().splitlines()) < 80
     monkeypatch.chdir(tmp_path)

@@ -92,10 +92,10 @@ def moments_of(data: mujoco.MjData) -> tuple[np.ndarray, ...]:
     return data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
 
 
-KINDS = ["kinds", "spatial", pytest.param("shadow_hand", marks=pytest.mark.thorough)]
+MODELS = ["kinds", *[pytest.param(kind, marks=pytest.mark.thorough) for kind in ("spatial", "shadow_hand")]]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MODELS)
 def test_efforts_and_commands_are_those_of_mujoco(kind):
     hand, qpos, grasps = scene(kind)
     model, numbers = hand.model, [hand.model.actuator(name).id for name in hand.actuator_names]
@@ -117,7 +117,7 @@ def test_efforts_and_commands_are_those_of_mujoco(kind):
         np.testing.assert_allclose(data.qfrc_actuator[hand.dofs], B @ efforts[lane], atol=EXACT)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MODELS)
 def test_limits_are_those_of_mujoco(kind):
     hand, qpos, grasps = scene(kind)
     model, numbers = hand.model, [hand.model.actuator(name).id for name in hand.actuator_names]

@@ -49,6 +49,7 @@ def check(function, qpos: np.ndarray, step: float, seed: int = 0) -> None:
     np.testing.assert_allclose(reverse, both, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_contacts():
     model = finger('<actuator><position joint="b" kp="2"/></actuator>', objects=PARTS)
     hand = HandObject.from_mjcf(model, "object", contact_distance=0.0, max_contacts=6)

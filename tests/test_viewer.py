@@ -29,6 +29,7 @@ def ranking_of(margin, status=None, top=3) -> Ranking:
         object_forces=forces,
         effort=np.where(np.isnan(margin[order[:top]]), np.nan, 8.0),
         tightening_status=np.zeros(len(forces), dtype=int),
+        controls=np.zeros((len(forces), 0)),
     )
 
 
