@@ -119,6 +119,7 @@ def test_blocking_forces_and_worst_case():
         assert abs(np.sum(found[i] * direction) - difference) <= 1e-5 * abs(difference)
 
 
+@pytest.mark.thorough
 def test_smoothed_sets_bound_the_sets():
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(50, 6))

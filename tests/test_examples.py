@@ -13,12 +13,12 @@ def test_they_are_numbered():
     assert len(EXAMPLES) >= 2
 
 
-SLOW = "03_mesh_to_grasp"
+SLOW = ("02_tightening_and_blocking_forces", "03_mesh_to_grasp")
 
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=pytest.mark.thorough) if path.stem == SLOW else path for path in EXAMPLES],
+    [pytest.param(path, marks=pytest.mark.thorough) if path.stem in SLOW else path for path in EXAMPLES],
     ids=lambda path: path.stem,
 )
 def test_example(path, tmp_path, monkeypatch, capsys):

@@ -253,7 +253,7 @@ def moved(geom: Geom, motion: jax.Array) -> Geom:
         ("sphere", "ellipsoid"),
         ("sphere", "cylinder"),
         ("capsule", "capsule"),
-        ("capsule", "box"),
+        pytest.param(("capsule", "box"), marks=pytest.mark.thorough),
         pytest.param(("box", "box"), marks=pytest.mark.thorough),
         pytest.param(("sphere", "mesh"), marks=pytest.mark.thorough),
         pytest.param(("box", "mesh"), marks=pytest.mark.thorough),
