@@ -15,7 +15,7 @@ switched off here and not among ours.
 - Boxes inside each other: up to 5 % deeper than the distance in 1 of 100, in C's contacts as in ours: the face within
   8 degrees of the edges' axis takes its place.
 - Meshes and cylinders inside each other: another local maximum of the separation in 1 of 1,000 (of those inside), by
-  up to 0.1 mm: ours climbs from five directions.
+  up to 0.1 mm: ours climbs from a few directions only.
 """
 
 import itertools

@@ -84,16 +84,6 @@ class Actuation:
             unreached=None if unreached is None else unreached.astype(dtype),
         )
 
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """The leading axes that all leaves broadcast to."""
-        return jnp.broadcast_shapes(
-            self.jacobian.shape[:-3],
-            self.transmission.shape[:-2],
-            self.lower.shape[:-1],
-            self.upper.shape[:-1],
-        )
-
     def joint_torques(self, forces: Float[Array, "*batch contacts 3"]) -> Float[Array, "*batch joints"]:
         """J'f: the joint torques that put the forces (*batch, n_c, 3), N, contact frames, on the object; N m or N."""
         return jnp.einsum("...iav,...ia->...v", self.jacobian, forces)

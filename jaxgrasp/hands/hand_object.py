@@ -12,7 +12,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import as_float, safe_divide, safe_norm
+from jaxgrasp.arrays import as_float, safe_norm
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts, required_wrench
 from jaxgrasp.hands.actuators import Actuators, read_actuators
@@ -21,7 +21,7 @@ from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.grasps import HandGrasps
 from jaxgrasp.hands.kinematics import FREE, HINGE, SLIDE, Kinematics, Poses, matrices, place
 from jaxgrasp.hands.tendons import spatial_transmission
-from jaxgrasp.hands.touching import PairTable, Points, pair_table, touching_points
+from jaxgrasp.hands.touching import PairTable, Points, merged_point, pair_table, touching_points
 
 # Quaternions are normalised; farther from 1 than this they are taken for a mistake.
 _QUATERNION_TOLERANCE = 1e-3
@@ -42,6 +42,7 @@ class HandObject:
     dofs: np.ndarray
     """Their degrees of freedom."""
     contact_distance: float
+    """m; see `from_mjcf`, as for what follows."""
     max_contacts: int
     max_force: float
     friction: float | None
@@ -325,24 +326,10 @@ class HandObject:
         merged, friction, links = [], [], np.unique(table.link)
         for link in links:
             rows = np.flatnonzero(table.link == link)
-            merged.append(self._merged(Points(*[x[:, rows] for x in points])))
+            merged.append(merged_point(Points(*[x[:, rows] for x in points]), self.merge, self.contact_distance))
             friction.append(table.friction[rows].min())
         stacked = [jnp.stack(parts, 1) for parts in zip(*merged, strict=True)]
         return Points(*stacked), np.array(friction), links
-
-    def _merged(self, points: Points) -> Points:
-        """One point for those of a link (n, slots, ...)."""
-        nearest = points.distance.argmin(-1)[:, None]
-        best = [jnp.take_along_axis(x, nearest.reshape(-1, *[1] * (x.ndim - 1)), 1) for x in points]
-        near = safe_norm(points.position - best[0]) <= self.merge
-        share = (near & (points.distance <= self.contact_distance)).astype(points.position.dtype)
-        # Where nothing touches, the nearest point stands for itself.
-        own = jnp.arange(share.shape[-1]) == nearest
-        share = jnp.where(share.any(-1, keepdims=True), share, own.astype(share.dtype))
-        # Slots that hold no point may hold anything.
-        mean = lambda x: jnp.sum(jnp.where(share[..., None] > 0, x, 0), 1) / share.sum(-1, keepdims=True)  # noqa: E731
-        normal = mean(points.normal)
-        return Points(mean(points.position), safe_divide(normal, safe_norm(normal)[..., None]), best[2][:, 0])
 
     def _transmission(
         self,

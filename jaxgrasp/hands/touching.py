@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxgrasp.arrays import safe_divide, safe_norm
 from jaxgrasp.geometry.pairs import Geom, Hull, slots, touch
 
 KIND = {
@@ -117,6 +118,27 @@ def touching_points(table: PairTable, positions: jax.Array, rotations: jax.Array
     position, normal, distance = (lay_out(*parts) for parts in zip(*found, strict=True))
     # MuJoCo's normal, and that of the pairs, points from the hand to the object: ours is the object's outward normal.
     return Points(position, -normal, distance)
+
+
+def merged_point(points: Points, merge: float, contact_distance: float) -> Points:
+    """One point (n, ...) for those of a link (n, slots, ...): the mean of the touching ones near the nearest.
+
+    Args:
+        points: Batch first.
+        merge: How near to the nearest one, m.
+        contact_distance: How near the object, m.
+    """
+    nearest = points.distance.argmin(-1)[:, None]
+    best = [jnp.take_along_axis(x, nearest.reshape(-1, *[1] * (x.ndim - 1)), 1) for x in points]
+    near = safe_norm(points.position - best[0]) <= merge
+    share = (near & (points.distance <= contact_distance)).astype(points.position.dtype)
+    # Where nothing touches, the nearest point stands for itself.
+    own = jnp.arange(share.shape[-1]) == nearest
+    share = jnp.where(share.any(-1, keepdims=True), share, own.astype(share.dtype))
+    # Slots that hold no point may hold anything.
+    mean = lambda x: jnp.sum(jnp.where(share[..., None] > 0, x, 0), 1) / share.sum(-1, keepdims=True)  # noqa: E731
+    normal = mean(points.normal)
+    return Points(mean(points.position), safe_divide(normal, safe_norm(normal)[..., None]), best[2][:, 0])
 
 
 def _geoms(table: PairTable, positions: jax.Array, rotations: jax.Array, geoms: np.ndarray, hull: Hull | None) -> Geom:
