@@ -43,7 +43,15 @@ MEDIAN_ITERATIONS, TAIL_ITERATIONS = 7, 11
 """The median and the 99th percentile over all problems."""
 
 
-@pytest.fixture(scope="module", params=problems.GROUPS)
+QUICK = ("3 contacts", "4 contacts", "8 contacts, hexagonal", "20 contacts")
+"""The groups that the quicker of the two test commands goes through."""
+
+
+def quick_or_thorough(names) -> list:
+    return [name if name in QUICK else pytest.param(name, marks=pytest.mark.thorough) for name in names]
+
+
+@pytest.fixture(scope="module", params=quick_or_thorough(problems.GROUPS))
 def name(request) -> str:
     return request.param
 
@@ -110,6 +118,7 @@ class TestLargestDisturbance:
         wrong = ~(violation <= ROW_TOLERANCE)
         assert not wrong.any(), harness.tell(group, wrong, violation=violation, status=ours.status, margin=ours.margin)
 
+    @pytest.mark.thorough
     def test_iterations(self):
         iterations = np.concatenate([harness.margins(name).iterations for name in problems.GROUPS])
         status = np.concatenate([harness.margins(name).status for name in problems.GROUPS])
@@ -181,7 +190,7 @@ class TestLeastEffort:
         assert not wrong.any(), harness.tell(group, wrong, status=ours.status, upper=harness.margins(name).upper_bound)
 
 
-@pytest.mark.parametrize("name", ["3 contacts", "4 contacts", "5 contacts", "8 contacts"])
+@pytest.mark.parametrize("name", quick_or_thorough(["3 contacts", "4 contacts", "5 contacts", "8 contacts"]))
 def test_keeping_the_directions_apart_changes_nothing(name):
     group, reduced = problems.group(name), harness.margins(name)
     unloaded = ~group.batch.required_wrench.any(axis=-1) & (group.batch.cone_margin == 0)

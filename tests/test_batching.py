@@ -111,6 +111,7 @@ def test_vmap_and_vmap_of_vmap(batch, direct):
     assert_same(flattened(twice, 2), direct)
 
 
+@pytest.mark.thorough
 def test_vmap_over_one_argument_alone(batch, direct):
     contacts, disturbances, load, cone_margin = harness.data_of(batch)
     lane = 9
@@ -172,6 +173,7 @@ def test_a_second_direct_call_compiles_nothing(batch, compilations):
     assert len(compilations) == before
 
 
+@pytest.mark.thorough
 def test_vmap_costs_what_the_direct_batch_costs():
     some = problems.make_family(99, TIMED_LANES, 4, problems.Setting(closure="around"), 6)
     data = harness.data_of(some)

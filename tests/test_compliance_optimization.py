@@ -87,6 +87,7 @@ def test_compliance_is_diagonal_positive_and_bounded(contacts, result):
     np.testing.assert_array_equal(entries[flat], 1)
 
 
+@pytest.mark.thorough
 def test_benchmark_solves_the_unreduced_program(contacts):
     whole = jax.tree.map(lambda v: v[:4], contacts)
     found = unreduced_margins(whole, jnp.asarray(problems.SIX_FORCES), jnp.zeros((4, 6)))

@@ -118,6 +118,7 @@ def sphere(count: int) -> np.ndarray:
     return np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=-1)
 
 
+@pytest.mark.thorough
 def test_a_sampled_ball_approaches_the_ball_from_above(batch):
     points = jnp.asarray(np.hstack([sphere(DENSE), np.zeros((DENSE, 3))]))
     ball, sampled = margins(batch, jg.DisturbanceSet.ball()), margins(batch, jg.DisturbanceSet.vertices(points))

@@ -297,7 +297,11 @@ def test_order_does_not_matter():
     assert slots("capsule", "sphere") == 1 and slots("box", "capsule") == 2
 
 
-@pytest.mark.parametrize("kinds", [("sphere", "ellipsoid"), ("capsule", "box"), ("box", "mesh")], ids="-".join)
+@pytest.mark.parametrize(
+    "kinds",
+    [("sphere", "ellipsoid"), ("capsule", "box"), pytest.param(("box", "mesh"), marks=pytest.mark.thorough)],
+    ids="-".join,
+)
 def test_single_precision(kinds):
     geoms = Meeting(kinds, 500).geoms
     double = run(kinds, geoms)

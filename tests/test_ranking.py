@@ -138,6 +138,7 @@ def test_frames_are_taken_as_they_are(grasps, ranking, direct):
     np.testing.assert_allclose(other.margin, ranking.margin, **CLOSE)
 
 
+@pytest.mark.thorough
 def test_nothing_disturbs(grasps):
     ranking = rank(grasps, jg.DisturbanceSet.vertices(jnp.zeros((1, 6))), gravity=GRAVITY, top=TOP, tile=TILE)
     unbounded = ranking.status == jg.Status.UNBOUNDED

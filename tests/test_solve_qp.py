@@ -41,7 +41,11 @@ def highs(q, A, b, G, h):
 
 @pytest.mark.parametrize(
     "dtype, size",
-    [("float64", qp_recipes.SIZES[1]), ("float32", qp_recipes.SIZES[1]), ("float64", qp_recipes.SIZES[4])],
+    [
+        ("float64", qp_recipes.SIZES[1]),
+        ("float32", qp_recipes.SIZES[1]),
+        pytest.param("float64", qp_recipes.SIZES[4], marks=pytest.mark.thorough),
+    ],
     ids=str,
 )
 def test_recipes(dtype, size):
