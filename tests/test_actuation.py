@@ -146,6 +146,8 @@ def moved():
     }
     sizes = {"positions": 1e-3, "jacobian": 1e-2, "transmission": 0.1, "upper": 0.1, "weight": 0.1}
     along = {name: sizes[name] * rng.normal(size=x.shape) for name, x in start.items()}
+    # Turned and stretched, so that what no actuator reaches does not become reached.
+    along["transmission"] = sizes["transmission"] * rng.normal(size=(JOINTS, JOINTS)) @ hand.transmission
 
     def task(t):
         at = {name: x + t * along[name] for name, x in start.items()}

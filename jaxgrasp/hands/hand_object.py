@@ -47,7 +47,7 @@ class HandObject:
     max_force: float
     friction: float | None
     merge: float | None
-    _kinematics: Kinematics
+    kinematics: Kinematics
     _table: PairTable
     _actuators: Actuators
     _couplings: Couplings
@@ -113,7 +113,7 @@ class HandObject:
             max_force=float(max_force),
             friction=friction,
             merge=merge,
-            _kinematics=Kinematics(model),
+            kinematics=Kinematics(model),
             _table=pair_table(model, hand, of_object),
             _actuators=read_actuators(model, dofs),
             _couplings=read_couplings(model, dofs),
@@ -234,9 +234,9 @@ class HandObject:
         Returns:
             Points (n, slots, ...), world frame, and d distance / d joint position, m/rad or 1, while the object rests.
         """
-        poses = self._kinematics.poses(qpos.T)
+        poses = self.kinematics.poses(qpos.T)
         points = self._slots(poses)
-        velocity = self._velocities(poses, points.position, self.moved_bodies[self.slot_links])
+        velocity = self.point_velocities(poses, points.position, self.moved_bodies[self.slot_links])
         return points, jnp.einsum("nsvi,nsi->nsv", velocity, points.normal)
 
     @cached_property
@@ -257,7 +257,7 @@ class HandObject:
         """For (n, nq)."""
         admissible = self._admissible(qpos)
         safe = jnp.where(admissible[:, None], qpos, jnp.asarray(self.model.qpos0, qpos.dtype))
-        poses = self._kinematics.poses(safe.T)
+        poses = self.kinematics.poses(safe.T)
         rotation = jnp.moveaxis(poses.rotations[:, :, self.object_body], -1, 0)
         centre = self._mass_centre(poses)
         points, friction, links = self._points(poses)
@@ -342,7 +342,7 @@ class HandObject:
     ) -> tuple[jax.Array, Actuation, jax.Array]:
         """Actuator lengths, actuation and joint stiffness; `world` (n, n_c, 3) are the contacts."""
         model, dtype = self.model, qpos.dtype
-        velocity = self._velocities(poses, world, jnp.asarray(self.moved_bodies)[links])
+        velocity = self.point_velocities(poses, world, jnp.asarray(self.moved_bodies)[links])
         turned = jnp.einsum("nji,ncvj->ncvi", rotation, velocity)
         # Contacts that are not admissible have no frames.
         jacobian = jnp.einsum("ncia,ncvi->ncav", jnp.where(jnp.isnan(frames), 0, frames), turned)
@@ -369,7 +369,7 @@ class HandObject:
             whole["unreached"] = spread(actuation.unreached, 2)
         return lengths, replace(actuation, **whole), spread(stiffness, 2)
 
-    def _velocities(self, poses: Poses, points: jax.Array, moved: jax.Array | np.ndarray) -> jax.Array:
+    def point_velocities(self, poses: Poses, points: jax.Array, moved: jax.Array | np.ndarray) -> jax.Array:
         """Velocities (n, k, joints, 3) of points (n, k, 3) on the hand, by the joints that move them."""
         axes, anchors = (x[:, self.joints].T[:, None] for x in (poses.axes, poses.anchors))
         hinge = jnp.asarray(self.model.jnt_type[self.joints] == HINGE)[:, None]

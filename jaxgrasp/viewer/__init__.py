@@ -1,7 +1,17 @@
 """Figures of grasps and rankings, made with matplotlib and no window."""
 
 from jaxgrasp.viewer.grasp import draw_grasp
+from jaxgrasp.viewer.movie import write_movie
 from jaxgrasp.viewer.ranking import figure_of_ranking, write_figure
+from jaxgrasp.viewer.simulation import figure_of_motions, figure_of_pushes
 from jaxgrasp.viewer.synthesis import figure_of_synthesis
 
-__all__ = ["draw_grasp", "figure_of_ranking", "figure_of_synthesis", "write_figure"]
+__all__ = [
+    "draw_grasp",
+    "figure_of_motions",
+    "figure_of_pushes",
+    "figure_of_ranking",
+    "figure_of_synthesis",
+    "write_figure",
+    "write_movie",
+]

@@ -57,7 +57,7 @@ def draw_scenes(
     newtons_per_mm = round_scale(float(strongest) / (1e3 * _LONGEST_ARROW)) if strongest > 0.0 else np.nan
     arrows = forces / (1e3 * newtons_per_mm) if strongest > 0.0 else forces
 
-    model = _for_pictures(model)
+    model = for_pictures(model)
     with offscreen(model, _PIXELS, _PIXELS) as render:
         pictures = [render(_scene(model, *each)) for each in zip(configurations, contact_points, arrows, strict=True)]
     write_figure(_compose(pictures, titles, newtons_per_mm), path)
@@ -81,10 +81,10 @@ def _of_object(model: mujoco.MjModel) -> Bool[np.ndarray, " geoms"]:
     return np.isin(model.body_rootid[model.geom_bodyid], free)
 
 
-def _for_pictures(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy that is lit from the camera and through whose hand one can see."""
+def for_pictures(model: mujoco.MjModel, pixels: int = _PIXELS) -> mujoco.MjModel:
+    """A copy that is lit from the camera and through whose hand one can see, for square pictures."""
     model = copy(model)
-    model.vis.global_.offwidth = model.vis.global_.offheight = _PIXELS
+    model.vis.global_.offwidth = model.vis.global_.offheight = pixels
     model.vis.headlight.ambient[:] = 0.45
     model.vis.headlight.diffuse[:] = 0.45
     model.vis.headlight.specular[:] = 0.0
@@ -118,10 +118,10 @@ def _scene(model: mujoco.MjModel, configuration: np.ndarray, points: np.ndarray,
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         scene.flags[flag] = 0
-    _add_background(scene)
+    add_background(scene)
     for number, tail, tip in zip(drawn.tolist(), tails, tips, strict=True):
         colour = to_rgba(CONTACT_COLOURS[number % len(CONTACT_COLOURS)])
-        _add_arrow(scene, tail, tip, 0.02 * radius, colour)
+        add_arrow(scene, tail, tip, 0.02 * radius, colour)
     return scene
 
 
@@ -140,7 +140,7 @@ def _view(pushes: Float[np.ndarray, "arrows 3"]) -> tuple[float, float]:
     return float(azimuths[best]), float(elevations[best])
 
 
-def _add_arrow(
+def add_arrow(
     scene: mujoco.MjvScene, tail: np.ndarray, tip: np.ndarray, width: float, colour: tuple[float, ...]
 ) -> None:
     kind = mujoco.mjtGeom.mjGEOM_ARROW
@@ -150,7 +150,7 @@ def _add_arrow(
     geom.emission = 0.15
 
 
-def _add_background(scene: mujoco.MjvScene) -> None:
+def add_background(scene: mujoco.MjvScene) -> None:
     """A white wall behind everything: without a sky in the model the background is black."""
     eye = scene.camera[0]
     geom = _add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, (1.0, 1.0, 1.0, 1.0))

@@ -1,0 +1,231 @@
+"""Is the margin true? `python -m benchmarks.margin_study [--quick]`.
+
+Random grasps of the four-finger hand are simulated in C MuJoCo while they are pushed with a share of their margin, and
+the share of them that holds is drawn over the push. Writes margin_study.md and margin_study.png beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.progress import Progress
+
+jax.config.update("jax_enable_x64", True)
+
+import jaxgrasp as jg  # noqa: E402
+from jaxgrasp.contact.friction import pyramid_facets  # noqa: E402
+from jaxgrasp.hands import HandGrasps, sample_configurations  # noqa: E402
+from jaxgrasp.simulation import ComputedTorque, JointSprings, Push, Run, Simulator, torque_hand  # noqa: E402
+from jaxgrasp.viewer import write_figure  # noqa: E402
+
+OBJECTS = ("sphere", "box", "cylinder", "ellipsoid")
+FRICTIONS = (0.4, 0.6, 0.8, 1.0)
+GRASPS = 75
+"""Of each object."""
+STRENGTHS = np.arange(9) / 4
+SHARE = 0.95
+"""Of the margin, for which (22) finds the tightening forces."""
+LEAST = 0.2
+"""N: grasps with a smaller margin are left out, so that pushes are well above what the simulation resolves."""
+BEGIN, PUSHED, AFTER = 0.05, 0.1, 0.1
+SLIDING = 1e-3
+"""m: with more slip than this a grasp was held by luck."""
+STIFFNESS = 2.0
+"""N m/rad of every joint."""
+OPEN = -0.7
+"""rad, where the first flexing joint of a finger that takes no part stands."""
+BOUNDS = np.array([0, 0.25, 0.5, 0.7, 0.9, 1.0, 1.1, 1.3, 1.6, 2.0, np.inf])
+DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One way to tighten and to answer."""
+
+    name: str
+    tightened: bool = True
+    """By (22); else all fingers press alike, as hard in the mean."""
+    joint_compliance: bool = False
+    """Whether (21), (22) and the answer are those of Q = J J'/k in place of Q = I."""
+    passive: bool = False
+    """No feedback: springs in the joints alone."""
+
+
+ARMS = (
+    Arm("f_0 of (22), Q = I"),
+    Arm("untightened, Q = I", tightened=False),
+    Arm("f_0 of (22), Q = J J'/k", joint_compliance=True),
+    Arm("passive, f_0 for Q = I", passive=True),
+    Arm("passive, f_0 for Q = J J'/k", joint_compliance=True, passive=True),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of every simulated push of an arm."""
+
+    push: np.ndarray
+    """Over the margin of (21)."""
+    directional: np.ndarray
+    """Over the largest push in its direction that the forces at rest withstand, with the Q of the answer."""
+    other: np.ndarray
+    """The same, with Q = I for the answer."""
+    held: np.ndarray
+    slid: np.ndarray
+
+
+def grasps_on(object: str, count: int, seed: int) -> tuple[Simulator, np.ndarray, HandGrasps, np.ndarray]:
+    """A simulator, configurations with three or four fingertips on the object, their grasps and friction."""
+    sim = Simulator(torque_hand(object, gravity=False))
+    random = np.random.default_rng(seed)
+    qpos = sample_configurations(sim.hand, 12 * count, seed=seed)
+    # Every second grasp leaves a finger out.
+    for lane in range(0, len(qpos), 2):
+        finger = random.integers(4)
+        qpos[lane, 3 * finger : 3 * finger + 3] = 0.0, OPEN, 0.0
+    friction = random.choice(FRICTIONS, len(qpos))
+    grasps = sim.grasps(qpos)
+    contacts = replace(grasps.contacts, friction=jnp.broadcast_to(friction[:, None], grasps.contacts.friction.shape))
+    found = jg.largest_disturbance(contacts, jg.DisturbanceSet.forces(1.0))
+    good = (found.status == jg.Status.SOLVED) & (found.margin > LEAST) & (contacts.active.sum(-1) >= 3)
+    chosen = np.flatnonzero(np.asarray(good))
+    few = np.asarray(contacts.active.sum(-1))[chosen] == 3
+    chosen = np.sort(np.concatenate([chosen[few][: count // 2], chosen[~few][: count - count // 2]]))
+    assert len(chosen) == count, f"{object}: {few.sum()} of {len(few)} grasps have three contacts"
+    pick = lambda tree: jax.tree.map(lambda x: x[chosen], tree)  # noqa: E731
+    return sim, qpos[chosen], replace(pick(grasps), contacts=pick(contacts)), friction[chosen]
+
+
+def stiff_compliance(grasps: HandGrasps) -> jax.Array:
+    """Q = J J'/k, a little of the identity added where joints cannot move a contact."""
+    jacobian = grasps.actuation.jacobian
+    tall = jacobian.reshape(len(jacobian), -1, jacobian.shape[-1])
+    return tall @ jnp.swapaxes(tall, -1, -2) / STIFFNESS + 1e-5 * jnp.eye(tall.shape[1])
+
+
+def directional(contacts: jg.Contacts, forces: np.ndarray, pushes: np.ndarray, compliance: jax.Array) -> np.ndarray:
+    """How often each push (n, k, 6) may act before a facet is reached, starting from forces (n, n_c, 3)."""
+    blocking = np.asarray(jg.blocking_forces(contacts, pushes, compliance=compliance))
+    facets = np.asarray(pyramid_facets(8))
+    rows = facets * np.stack([*[np.ones_like(contacts.friction)] * 2, contacts.friction], -1)[:, :, None]
+    reserve = -np.einsum("ncea,nca->nce", rows, forces)[:, None]
+    used = np.einsum("ncea,nkca->nkce", rows, blocking)
+    active = np.asarray(contacts.active)[:, None, :, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.where(active & (used > 1e-9), reserve / used, np.inf)
+    return np.maximum(factor.min((-2, -1)), 0)
+
+
+def run_arm(
+    arm: Arm, sim: Simulator, qpos: np.ndarray, grasps: HandGrasps, friction: np.ndarray, each: bool, seed: int
+) -> Outcome:
+    """Simulates all grasps, all strengths, and one random direction or each of six."""
+    contacts, unit = grasps.contacts, jg.DisturbanceSet.forces(1.0)
+    identity = jnp.broadcast_to(jnp.eye(3 * contacts.n_c), (len(qpos), 3 * contacts.n_c, 3 * contacts.n_c))
+    compliance = stiff_compliance(grasps) if arm.joint_compliance else identity
+    margin = jg.largest_disturbance(contacts, unit, compliance=compliance).margin
+    found = jg.least_effort(contacts, unit, SHARE * margin, compliance=compliance)
+    margin, forces = np.asarray(margin), np.asarray(found.forces)
+    assert np.all(np.asarray(found.status) == jg.Status.SOLVED)
+    active = np.asarray(contacts.active)
+    if not arm.tightened:
+        mean = forces[..., 2].sum(-1) / active.sum(-1)
+        forces = np.zeros_like(forces)
+        forces[..., 2] = np.where(active, mean[:, None], 0)
+    random = np.random.default_rng(seed)
+    per = 6 if each else 1
+    # Lanes: grasp, strength, direction.
+    shape = (len(qpos), len(STRENGTHS), per)
+    which = np.broadcast_to(np.arange(6), shape) if each else random.integers(0, 6, shape)
+    # The pushes are along the object's axes, in which the set is given.
+    pushes = np.zeros((*shape, 6))
+    pushes[..., :3] = DIRECTIONS[which]
+    pushes *= (STRENGTHS[:, None] * margin[:, None, None])[..., None]
+    flat = pushes.reshape(len(qpos), -1, 6)
+    rest = forces
+    if not arm.tightened:
+        G = np.asarray(jg.grasp_map(contacts))
+        unbalanced = np.einsum("nwa,na->nw", G, forces.reshape(len(G), -1))[:, None]
+        rest = forces + np.asarray(jg.blocking_forces(contacts, unbalanced, compliance=compliance))[:, 0]
+    answer = stiff_compliance(grasps) if arm.passive else compliance
+    factors = [directional(contacts, rest, flat, Q) for Q in (answer, identity)]
+    turned = np.einsum("nij,nkj->nki", np.asarray(grasps.object_rotation), flat[..., :3])
+    repeat = lambda x: np.repeat(np.asarray(x), flat.shape[1], 0)  # noqa: E731
+    if arm.passive:
+        controller = JointSprings(torques=repeat(grasps.actuation.joint_torques(forces)), stiffness=STIFFNESS)
+    else:
+        controller = ComputedTorque(compliance=repeat(answer))
+    wrench = np.concatenate([turned, np.zeros_like(turned)], -1).reshape(-1, 6)
+    course: Run = sim.run(
+        repeat(qpos), repeat(forces), controller, Push(wrench=wrench, begin=BEGIN, duration=PUSHED),
+        BEGIN + PUSHED + AFTER, friction=repeat(friction),
+    )  # fmt: skip
+    with np.errstate(divide="ignore"):
+        over = [(1 / factor).ravel() for factor in factors]
+    strength = np.broadcast_to(STRENGTHS[:, None], shape).ravel()
+    return Outcome(strength, *over, ~course.lost, course.worst_slip() > SLIDING)
+
+
+def interval(held: int, count: int) -> tuple[float, float]:
+    """Wilson's, 95 %."""
+    z = 1.96
+    share, spread = held / count, z * np.sqrt(held * (count - held) / count + z * z / 4) / (count + z * z)
+    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
+    return centre - spread, centre + spread
+
+
+def shares(held: np.ndarray, over: np.ndarray, bounds: np.ndarray) -> list[tuple[int, int]]:
+    """(held, all) in every bin."""
+    place = np.digitize(over, bounds) - 1
+    return [(int(held[place == b].sum()), int((place == b).sum())) for b in range(len(bounds) - 1)]
+
+
+def told(held: int, count: int) -> str:
+    if count == 0:
+        return ""
+    low, high = interval(held, count)
+    return f"{100 * held / count:.1f} ({100 * low:.0f}-{100 * high:.0f}), {count}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="one random direction for every strength, not all six")
+    each = not parser.parse_args().quick
+    begun = time.perf_counter()
+    outcomes: dict[str, list[Outcome]] = {arm.name: [] for arm in ARMS}
+    with Progress() as progress:
+        task = progress.add_task("simulating", total=len(OBJECTS) * len(ARMS))
+        for seed, object in enumerate(OBJECTS):
+            found = grasps_on(object, GRASPS, seed)
+            for arm in ARMS:
+                outcomes[arm.name].append(run_arm(arm, *found, each, seed))
+                progress.advance(task)
+    results = {
+        name: Outcome(*map(np.concatenate, zip(*[vars(o).values() for o in parts], strict=True)))
+        for name, parts in outcomes.items()
+    }
+    seconds = time.perf_counter() - begun
+    np.savez("/work/scratch/s13/study.npz", **{f"{n}|{k}": v for n, o in results.items() for k, v in vars(o).items()})
+    for name, o in results.items():
+        print(name, "slid but held", (o.held & o.slid).mean())
+        print(
+            "  push    ",
+            [told(*x) for x in [(int(o.held[o.push == s].sum()), int((o.push == s).sum())) for s in STRENGTHS]],
+        )
+        print("  direct  ", [told(*x) for x in shares(o.held, o.directional, BOUNDS)])
+        print("  Q=I     ", [told(*x) for x in shares(o.held, o.other, BOUNDS)])
+    print(seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,18 @@
+"""A controlled hand that holds an object while it is pushed: the experiments of section V, in C MuJoCo."""
+
+from jaxgrasp.simulation.control import ComputedTorque, ForceOptimization, Impedance, JointSprings
+from jaxgrasp.simulation.path import Path
+from jaxgrasp.simulation.run import Push, Run
+from jaxgrasp.simulation.simulator import Simulator, torque_hand
+
+__all__ = [
+    "ComputedTorque",
+    "ForceOptimization",
+    "Impedance",
+    "JointSprings",
+    "Path",
+    "Push",
+    "Run",
+    "Simulator",
+    "torque_hand",
+]

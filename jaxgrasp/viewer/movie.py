@@ -1,0 +1,97 @@
+"""Moving pictures of simulated hands that are pushed."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw
+
+from jaxgrasp.simulation import Run
+from jaxgrasp.viewer.offscreen import offscreen
+from jaxgrasp.viewer.scene import add_arrow, add_background, for_pictures
+
+_PIXELS = 300
+_FRAME = 0.05
+# m a newton, of the push's arrow.
+_ARROW = 0.015
+_PUSH, _RING = (0.80, 0.15, 0.15, 1.0), 0.0025
+_AZIMUTH, _ELEVATION, _DISTANCE = 130.0, -22.0, 0.34
+
+
+def write_movie(
+    path: Path | str,
+    model: mujoco.MjModel,
+    runs: Sequence[tuple[str, Run, int]],
+    *,
+    begin: float = 0.0,
+    end: float = np.inf,
+    slower: float = 1.0,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Renders lanes of runs beside each other and writes them as an animated GIF; pushes are red arrows.
+
+    Args:
+        path: The file, `.gif`.
+        model: Hand and object of all of them.
+        runs: Title, run and lane of every panel.
+        begin: Of what is shown, s.
+        end: s.
+        slower: How many times slower than in the world.
+        progress: Called with the number of frames done and their number.
+
+    Raises:
+        RuntimeError: No OpenGL context can be had; the message names the remedy.
+        OSError: The file cannot be written.
+    """
+    time = runs[0][1].time
+    moments = np.arange(max(begin, time[0]), min(end, time[-1]) + 1e-9, _FRAME / slower)
+    steps = np.minimum(np.searchsorted(time, moments - 1e-9), len(time) - 1)
+    model, frames = for_pictures(model, _PIXELS), []
+    data = mujoco.MjData(model)
+    data.qpos[:] = runs[0][1].qpos[0, runs[0][2]]
+    mujoco.mj_forward(model, data)
+    centre = data.body("object").xipos.copy()
+    with offscreen(model, _PIXELS, _PIXELS) as render:
+        for number, step in enumerate(steps):
+            panels = [_panel(model, data, render, run, lane, step, centre) for _, run, lane in runs]
+            frames.append(_labelled(panels, [title for title, _, _ in runs], time[step]))
+            if progress is not None:
+                progress(number + 1, len(steps))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1e3 * _FRAME), loop=0, optimize=True)
+
+
+def _panel(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    render: Callable[[mujoco.MjvScene], UInt8[np.ndarray, "height width 3"]],
+    run: Run,
+    lane: int,
+    step: int,
+    centre: np.ndarray,
+) -> UInt8[np.ndarray, "height width 3"]:
+    data.qpos[:] = run.qpos[step, lane]
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:], camera.distance = centre - [0, 0, 0.02], _DISTANCE
+    camera.azimuth, camera.elevation = _AZIMUTH, _ELEVATION
+    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        scene.flags[flag] = 0
+    add_background(scene)
+    force = run.push.at(run.time[step])[lane, :3]
+    if force.any():
+        tip = data.body("object").xipos
+        add_arrow(scene, tip - _ARROW * force, tip, _RING, _PUSH)
+    return render(scene)
+
+
+def _labelled(panels: list[np.ndarray], titles: list[str], time: float) -> Image.Image:
+    picture = Image.fromarray(np.concatenate(panels, 1))
+    pen = ImageDraw.Draw(picture)
+    for number, title in enumerate(titles):
+        pen.text((number * _PIXELS + 8, 6), title, fill=(0, 0, 0))
+    pen.text((8, _PIXELS - 18), f"{time:.2f} s", fill=(90, 90, 90))
+    return picture
