@@ -7,17 +7,12 @@ the share of them that holds is drawn over the push. Writes margin_study.md and 
 from __future__ import annotations
 
 import argparse
-import platform
 import time
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, fields, replace
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from rich.progress import Progress
 
 jax.config.update("jax_enable_x64", True)
@@ -26,7 +21,6 @@ import jaxgrasp as jg  # noqa: E402
 from jaxgrasp.contact.friction import pyramid_facets  # noqa: E402
 from jaxgrasp.hands import HandGrasps, sample_configurations  # noqa: E402
 from jaxgrasp.simulation import ComputedTorque, JointSprings, Push, Run, Simulator, torque_hand  # noqa: E402
-from jaxgrasp.viewer import write_figure  # noqa: E402
 
 OBJECTS = ("sphere", "box", "cylinder", "ellipsoid")
 FRICTIONS = (0.4, 0.6, 0.8, 1.0)
@@ -44,6 +38,7 @@ STIFFNESS = 2.0
 """N m/rad of every joint."""
 OPEN = -0.7
 """rad, where the first flexing joint of a finger that takes no part stands."""
+SAFE = 0.9
 BOUNDS = np.array([0, 0.25, 0.5, 0.7, 0.9, 1.0, 1.1, 1.3, 1.6, 2.0, np.inf])
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 
@@ -82,11 +77,13 @@ class Outcome:
     """The same, with Q = I for the answer."""
     held: np.ndarray
     slid: np.ndarray
+    stands: np.ndarray
+    """Whether the grasp holds without a push."""
 
 
 def grasps_on(object: str, count: int, seed: int) -> tuple[Simulator, np.ndarray, HandGrasps, np.ndarray]:
     """A simulator, configurations with three or four fingertips on the object, their grasps and friction."""
-    sim = Simulator(torque_hand(object, gravity=False))
+    sim = Simulator.from_spec(torque_hand(object, gravity=False))
     random = np.random.default_rng(seed)
     qpos = sample_configurations(sim.hand, 12 * count, seed=seed)
     # Every second grasp leaves a finger out.
@@ -128,8 +125,8 @@ def directional(contacts: jg.Contacts, forces: np.ndarray, pushes: np.ndarray, c
 
 def run_arm(
     arm: Arm, sim: Simulator, qpos: np.ndarray, grasps: HandGrasps, friction: np.ndarray, each: bool, seed: int
-) -> Outcome:
-    """Simulates all grasps, all strengths, and one random direction or each of six."""
+) -> tuple[Outcome, np.ndarray]:
+    """Simulates all grasps, all strengths, and one random direction or each of six; also the margins."""
     contacts, unit = grasps.contacts, jg.DisturbanceSet.forces(1.0)
     identity = jnp.broadcast_to(jnp.eye(3 * contacts.n_c), (len(qpos), 3 * contacts.n_c, 3 * contacts.n_c))
     compliance = stiff_compliance(grasps) if arm.joint_compliance else identity
@@ -172,8 +169,9 @@ def run_arm(
     )  # fmt: skip
     with np.errstate(divide="ignore"):
         over = [(1 / factor).ravel() for factor in factors]
-    strength = np.broadcast_to(STRENGTHS[:, None], shape).ravel()
-    return Outcome(strength, *over, ~course.lost, course.worst_slip() > SLIDING)
+    strength, held = np.broadcast_to(STRENGTHS[:, None], shape), ~course.lost.reshape(shape)
+    stands = np.broadcast_to(held[:, :1].all(-1, keepdims=True), shape)
+    return Outcome(strength.ravel(), *over, held.ravel(), course.worst_slip() > SLIDING, stands.ravel()), margin
 
 
 def interval(held: int, count: int) -> tuple[float, float]:
@@ -184,17 +182,109 @@ def interval(held: int, count: int) -> tuple[float, float]:
     return centre - spread, centre + spread
 
 
-def shares(held: np.ndarray, over: np.ndarray, bounds: np.ndarray) -> list[tuple[int, int]]:
-    """(held, all) in every bin."""
-    place = np.digitize(over, bounds) - 1
-    return [(int(held[place == b].sum()), int((place == b).sum())) for b in range(len(bounds) - 1)]
-
-
-def told(held: int, count: int) -> str:
-    if count == 0:
+def told(held: np.ndarray) -> str:
+    """Share in per cent with its interval, and of how many."""
+    if len(held) == 0:
         return ""
-    low, high = interval(held, count)
-    return f"{100 * held / count:.1f} ({100 * low:.0f}-{100 * high:.0f}), {count}"
+    low, high = interval(int(held.sum()), len(held))
+    return f"{100 * held.mean():.1f} ({100 * low:.1f}-{100 * high:.1f}) of {len(held)}"
+
+
+def joined(parts: list[Outcome]) -> Outcome:
+    return Outcome(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Outcome)))
+
+
+def below(outcome: Outcome, which: np.ndarray) -> str:
+    """Held below 0.9 of the directional margin."""
+    return told(outcome.held[(which < SAFE) & (outcome.push > 0) & outcome.stands])
+
+
+def draw(results: dict[str, Outcome]) -> Figure:
+    """Share that holds over the push over the margin, and over the directional margin."""
+    figure = Figure(figsize=(11.0, 4.2), layout="constrained", dpi=150)
+    axes = figure.subplots(1, 2, sharey=True)
+    for number, (name, o) in enumerate(results.items()):
+        style = {"label": name, "color": f"C{number}", "marker": "o", "ms": 3.5, "lw": 1.2, "capsize": 2}
+        _curve(axes[0], o.push, o.held, np.unique(o.push), style)
+        middle = np.append((BOUNDS[:-2] + BOUNDS[1:-1]) / 2, BOUNDS[-2] + 0.15)
+        place = middle[np.clip(np.digitize(o.directional, BOUNDS) - 1, 0, len(middle) - 1)]
+        _curve(axes[1], place[o.stands], o.held[o.stands], middle, style)
+    axes[0].set(xlabel="push / margin of (21)", ylabel="share that holds", ylim=(-0.02, 1.02))
+    axes[1].set(xlabel="push / largest push in its direction, given the forces at rest")
+    axes[1].axvline(1.0, color="0.7", lw=0.8)
+    for panel in axes:
+        panel.grid(alpha=0.25)
+    axes[0].legend(fontsize=7.5)
+    return figure
+
+
+def _curve(axes: Axes, over: np.ndarray, held: np.ndarray, places: np.ndarray, style: dict) -> None:
+    rows = [(x, held[over == x]) for x in places if (over == x).any()]
+    share = np.array([h.mean() for _, h in rows])
+    spread = np.array([interval(int(h.sum()), len(h)) for _, h in rows]).T
+    axes.errorbar([x for x, _ in rows], share, np.abs(spread - share), **style)
+
+
+def wrapped(words: str) -> str:
+    return textwrap.fill(words, 120)
+
+
+def text(results: dict[str, Outcome], margins: dict[str, np.ndarray], seconds: float, each: bool) -> str:
+    count = len(OBJECTS) * GRASPS
+    along = "each of the six axes" if each else "one of the six axes, drawn for every strength"
+    lines = [
+        "# Is the margin true?",
+        "",
+        wrapped(
+            f"{count} random grasps of the torque-driven four-finger hand, {GRASPS} on each of {', '.join(OBJECTS)}, "
+            f"half of them with three fingertips and half with four, friction from {min(FRICTIONS)} to "
+            f"{max(FRICTIONS)}, no gravity, margins (21) of at least {LEAST} N under six unit forces with at most 2 N "
+            f"a finger. In C MuJoCo each is pushed for {PUSHED:g} s by 0 to 2 times its margin along {along}. Held: "
+            f"never farther than 1 cm from its place, and all fingers on the object {AFTER:g} s after the push. f_0 is "
+            "that of "
+            f"(22) at {SHARE:g} of the margin; untightened, all fingers press alike, as hard in the mean as f_0. Q "
+            f"is the compliance of (21), (22) and the answer; passive hands answer by springs of {STIFFNESS:g} N "
+            f"m/rad in their joints alone, whose Q is J J'/k. Shares are in per cent with 95 % intervals (Wilson)."
+        ),
+        "",
+        "| push / margin | " + " | ".join(results) + " |",
+        "|---" * (len(results) + 1) + "|",
+    ]
+    for strength in STRENGTHS:
+        row = [told(o.held[o.push == strength]) for o in results.values()]
+        lines.append(f"| {strength:g} | " + " | ".join(row) + " |")
+    lines.append("| median margin, N | " + " | ".join(f"{np.median(margins[name]):.2f}" for name in results) + " |")
+    lines += [
+        "",
+        wrapped(
+            "Over the **directional margin**: the largest push in the same direction that the forces at rest and "
+            "the blocking forces of the Q of the answer withstand in the friction pyramid. Grasps that are lost "
+            "without any push (first row above) are left out here."
+        ),
+        "",
+        "| push / directional margin | " + " | ".join(results) + " |",
+        "|---" * (len(results) + 1) + "|",
+    ]
+    for low, high in zip(BOUNDS[:-1], BOUNDS[1:], strict=True):
+        row = [
+            told(o.held[(low <= o.directional) & (o.directional < high) & o.stands & (o.push > 0)])
+            for o in results.values()
+        ]
+        lines.append(f"| {low:g} to {high:g} | " + " | ".join(row) + " |")
+    lines.append(f"| all below {SAFE:g} | " + " | ".join(below(o, o.directional) for o in results.values()) + " |")
+    lines.append(
+        f"| all below {SAFE:g} of that with Q = I | " + " | ".join(below(o, o.other) for o in results.values()) + " |"
+    )
+    lines += ["", "| held, but a fingertip slid by more than 1 mm | " + " | ".join(
+        f"{100 * (o.held & o.slid)[o.push > 0].mean():.1f} %" for o in results.values()) + " |",
+        "|---" * (len(results) + 1) + "|"]  # fmt: skip
+    lines += [
+        "",
+        f"{seconds / 60:.1f} min on {platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}, mujoco "
+        f"{mujoco.__version__}. Made by `python -m benchmarks.margin_study{'' if each else ' --quick'}`.",
+        "",
+    ]
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -203,28 +293,23 @@ def main() -> None:
     each = not parser.parse_args().quick
     begun = time.perf_counter()
     outcomes: dict[str, list[Outcome]] = {arm.name: [] for arm in ARMS}
+    margins: dict[str, list[np.ndarray]] = {arm.name: [] for arm in ARMS}
     with Progress() as progress:
         task = progress.add_task("simulating", total=len(OBJECTS) * len(ARMS))
         for seed, object in enumerate(OBJECTS):
             found = grasps_on(object, GRASPS, seed)
             for arm in ARMS:
-                outcomes[arm.name].append(run_arm(arm, *found, each, seed))
+                outcome, margin = run_arm(arm, *found, each, seed)
+                outcomes[arm.name].append(outcome)
+                margins[arm.name].append(margin)
                 progress.advance(task)
-    results = {
-        name: Outcome(*map(np.concatenate, zip(*[vars(o).values() for o in parts], strict=True)))
-        for name, parts in outcomes.items()
-    }
-    seconds = time.perf_counter() - begun
-    np.savez("/work/scratch/s13/study.npz", **{f"{n}|{k}": v for n, o in results.items() for k, v in vars(o).items()})
-    for name, o in results.items():
-        print(name, "slid but held", (o.held & o.slid).mean())
-        print(
-            "  push    ",
-            [told(*x) for x in [(int(o.held[o.push == s].sum()), int((o.push == s).sum())) for s in STRENGTHS]],
-        )
-        print("  direct  ", [told(*x) for x in shares(o.held, o.directional, BOUNDS)])
-        print("  Q=I     ", [told(*x) for x in shares(o.held, o.other, BOUNDS)])
-    print(seconds)
+    results = {name: joined(parts) for name, parts in outcomes.items()}
+    told = {name: np.concatenate(parts) for name, parts in margins.items()}
+    here, name = Path(__file__).parent, "margin_study_quick" if not each else "margin_study"
+    answer = text(results, told, time.perf_counter() - begun, each)
+    (here / f"{name}.md").write_text(answer)
+    write_figure(draw(results), here / f"{name}.png")
+    print(answer)
 
 
 if __name__ == "__main__":

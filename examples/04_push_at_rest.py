@@ -18,7 +18,7 @@ NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 WEIGHTS = (0.05, 0.1, 0.2, 0.5, 1.0, 10.0)
 
 # Four fingers around a ball of 5 cm and 0.1 kg, without gravity; at most 2 N a finger.
-sim = Simulator(torque_hand("sphere", friction=0.8, gravity=False), max_force=2.0)
+sim = Simulator.from_spec(torque_hand("sphere", friction=0.8, gravity=False), max_force=2.0)
 grasp = sim.grasps(sim.around[None])
 unit = jg.DisturbanceSet.forces(1.0)
 largest = jg.largest_disturbance(grasp.contacts, unit)

@@ -16,7 +16,7 @@ from jaxgrasp.viewer import figure_of_motions, write_figure, write_movie  # noqa
 SECONDS = 4.0
 NAMES = ("pushed", "not pushed")
 
-sim = Simulator(torque_hand("sphere", friction=0.8), max_force=2.0)
+sim = Simulator.from_spec(torque_hand("sphere", friction=0.8), max_force=2.0)
 grasp = sim.grasps(sim.around[None])
 unit, weight = jg.DisturbanceSet.forces(1.0), grasp.required_wrench
 largest = jg.largest_disturbance(grasp.contacts, unit, required_wrench=weight)

@@ -13,7 +13,7 @@ def test_they_are_numbered():
     assert len(EXAMPLES) >= 2
 
 
-SLOW = ("02_tightening_and_blocking_forces", "03_mesh_to_grasp")
+SLOW = ("02_tightening_and_blocking_forces", "03_mesh_to_grasp", "04_push_at_rest", "05_push_in_motion")
 
 
 @pytest.mark.parametrize(

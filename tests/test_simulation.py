@@ -27,7 +27,7 @@ PUSHES = np.array([[1.0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0]])
 
 @pytest.fixture(scope="module")
 def sim() -> Simulator:
-    return Simulator(torque_hand("sphere", gravity=False))
+    return Simulator.from_spec(torque_hand("sphere", gravity=False))
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ Both ask for a wrench on the object,
     F = M V'_d + N V - M g + (M + m GG') (2 zeta omega (V_d - V) + omega^2 e),
 
 with the error e of its pose and m of 20 g for what of a finger goes along with its tip, and both have the joints go
-along with the desired motion. What feedback adds passes through the contacts alone, so that what the fingers exert while
-a push acts is what the controller has chosen. With the fingers' inertia in feedback as well, M_h J^-1 G' V', a push along
-the fingers took a tenth of the normal force away.
+along with the desired motion. What feedback adds passes through the contacts alone: while a push acts the fingers
+exert what the controller has chosen. With the fingers' inertia in the feedback as well, M_h J^-1 G' V', a push along
+the fingers changes their normal forces, and contacts slide that f_0 would have held.
 """
 
 from dataclasses import dataclass
@@ -140,7 +140,7 @@ def _solve(matrix: Array, right: Array) -> Array:
 
 
 def _torques(state: State, goal: Goal, forces: Array) -> Float[Array, "lanes joints"]:
-    """tau = J'f and what the joints need for themselves."""
+    """Tau = J'f and what the joints need for themselves."""
     return goal.joint_torque + jnp.einsum("nav,na->nv", state.jacobian, forces)
 
 
@@ -168,8 +168,9 @@ class ForceOptimization:
     """The optimisation-based control of section V: one quadratic program a step, all lanes together.
 
     min 1/2 (w |G f - F|^2 + |f - f_0|^2 + w_q |J'(f - f_0) - tau_q|^2) over the contact forces f, subject to friction
-    pyramids and |J'f + tau_h| <= tau_max. The dynamics of object and joints are in F, in the torques tau_h of the joints
-    alone and in tau_q, which brings the joints to their posture; moments count by an arm of 3 cm, torques by one of 10 cm.
+    pyramids and |J'f + tau_h| <= tau_max. The dynamics of object and joints are in F, in the torques tau_h of the
+    joints alone and in tau_q, which brings the joints to their posture; moments count by an arm of 3 cm, torques by one
+    of 10 cm.
     """
 
     weight: Float[Array, " lanes"]

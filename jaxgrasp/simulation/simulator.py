@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path as File
 
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from mujoco import rollout
 
 from jaxgrasp.hands import HandGrasps, HandObject, close_fingers
@@ -79,14 +79,17 @@ def torque_hand(
 class Simulator:
     """The hand of `torque_hand` with one object."""
 
-    spec: mujoco.MjSpec
-    max_force: float = 2.0
-    """Largest normal force that tightening forces may have, N."""
-    hand: HandObject = field(init=False)
+    hand: HandObject
 
-    def __post_init__(self) -> None:
-        hand = HandObject.from_mjcf(self.spec, "object", max_contacts=_FINGERS, max_force=self.max_force)
-        object.__setattr__(self, "hand", hand)
+    @classmethod
+    def from_spec(cls, spec: mujoco.MjSpec, max_force: float = 2.0) -> "Simulator":
+        """A simulator of a scene that `torque_hand` has made.
+
+        Args:
+            spec: The scene.
+            max_force: Largest normal force that tightening forces may have, N.
+        """
+        return cls(HandObject.from_mjcf(spec, "object", max_contacts=_FINGERS, max_force=max_force))
 
     @cached_property
     def around(self) -> Float[np.ndarray, " nq"]:
@@ -107,7 +110,7 @@ class Simulator:
         push: Push,
         seconds: float,
         *,
-        impedance: Impedance = Impedance(),
+        impedance: Impedance | None = None,
         path: Path | None = None,
         friction: Float[np.ndarray, " lanes"] | None = None,
         replan: tuple[float, float] | None = None,
@@ -121,11 +124,12 @@ class Simulator:
             controller: What computes torques from what is measured, every step of 1 ms.
             push: What disturbs the object.
             seconds: How long.
-            impedance: Of the object, for controllers that feed it back.
+            impedance: Of the object, for controllers that feed it back; None is `Impedance()`.
             path: The object's desired motion; None keeps it where it begins.
             friction: Of the object in each lane; None is the scene's.
             replan: A distance, m, and a time, s: once the object is farther than this from where it should be, and so
-                much time has passed, its path begins anew where it then is and ends where and when it should have.
+                much time has passed, its path begins anew where it then is, as fast as it should then be, and ends
+                where and when it should have.
             progress: Called with the number of steps done.
 
         Returns:
@@ -133,6 +137,7 @@ class Simulator:
         """
         qpos, lanes, model = np.asarray(qpos, float), len(qpos), self.hand.model
         path = Path.rest(lanes) if path is None else path
+        impedance = Impedance() if impedance is None else impedance
         begun = self.grasps(qpos)
         origin, turned = np.asarray(begun.object_position), np.asarray(begun.object_rotation)
         tightening = np.asarray(tightening, float)
@@ -168,9 +173,8 @@ class Simulator:
                     due = (time >= seen + replan[1]) & ~again
                     again |= due
                     if due.any():
-                        twist = (measured.rotation[:, None] @ measured.twist.reshape(-1, 2, 3, 1)).reshape(-1, 6)
                         end = np.maximum(path.begin + path.duration, time + _SHORTEST)
-                        path = path.replaced(due, Path.to(path.goal, np.full(lanes, time), end, there, twist))
+                        path = path.replaced(due, Path.to(path.goal, np.full(lanes, time), end, there, speed))
                 if progress is not None:
                     progress(number + 1)
         time, qpos, there, place, sliding, sensed, commanded = map(np.array, zip(*course, strict=True))

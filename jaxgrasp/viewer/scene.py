@@ -143,6 +143,15 @@ def _view(pushes: Float[np.ndarray, "arrows 3"]) -> tuple[float, float]:
 def add_arrow(
     scene: mujoco.MjvScene, tail: np.ndarray, tip: np.ndarray, width: float, colour: tuple[float, ...]
 ) -> None:
+    """An arrow from tail to tip (3,), m, world frame.
+
+    Args:
+        scene: To which it is added.
+        tail: Where it begins.
+        tip: Where it ends.
+        width: Of its shaft, m.
+        colour: RGBA.
+    """
     kind = mujoco.mjtGeom.mjGEOM_ARROW
     geom = _add_geom(scene, kind, colour)
     # The renderer draws an arrow half as long as its geom says.

@@ -31,8 +31,8 @@ def figure_of_pushes(runs: Mapping[str, Run], labels: Sequence[str]) -> Figure:
             _mark(axes, run)
         panels[0, column].set_title(f"{title}: {int((~run.lost).sum())} of {len(run.lost)} held", fontsize=9)
         panels[1, column].set_xlabel("s")
-    panels[0, 0].set(ylabel="object away from its place, mm", ylim=(0, _FARTHEST))
-    panels[1, 0].set(ylabel="normal force of the weakest finger, N", ylim=(0, None))
+    panels[0, 0].set(ylabel="object off its place, mm", ylim=(0, _FARTHEST))
+    panels[1, 0].set(ylabel="weakest finger presses, N", ylim=(0, None))
     panels[0, -1].legend(fontsize=7, title="push along", title_fontsize=7)
     return figure
 
@@ -57,9 +57,7 @@ def figure_of_motions(runs: Mapping[str, Run], labels: Sequence[str]) -> Figure:
             _mark(axes, run)
         panels[0, column].set_title(title, fontsize=10)
         panels[2, column].set_xlabel("s")
-    for axes, label in zip(
-        panels[:, 0], ("x, mm", "y, mm", f"normal force of each finger, N ({labels[0]})"), strict=True
-    ):
+    for axes, label in zip(panels[:, 0], ("x, mm", "y, mm", f"fingers press, N ({labels[0]})"), strict=True):
         axes.set_ylabel(label)
     panels[2, 0].set_ylim(0, None)
     panels[0, -1].legend(fontsize=8)
