@@ -7,12 +7,19 @@ the share of them that holds is drawn over the push. Writes margin_study.md and 
 from __future__ import annotations
 
 import argparse
+import os
+import platform
+import textwrap
 import time
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from rich.progress import Progress
 
 jax.config.update("jax_enable_x64", True)
@@ -21,6 +28,7 @@ import jaxgrasp as jg  # noqa: E402
 from jaxgrasp.contact.friction import pyramid_facets  # noqa: E402
 from jaxgrasp.hands import HandGrasps, sample_configurations  # noqa: E402
 from jaxgrasp.simulation import ComputedTorque, JointSprings, Push, Run, Simulator, torque_hand  # noqa: E402
+from jaxgrasp.viewer import write_figure  # noqa: E402
 
 OBJECTS = ("sphere", "box", "cylinder", "ellipsoid")
 FRICTIONS = (0.4, 0.6, 0.8, 1.0)
@@ -297,16 +305,16 @@ def main() -> None:
     with Progress() as progress:
         task = progress.add_task("simulating", total=len(OBJECTS) * len(ARMS))
         for seed, object in enumerate(OBJECTS):
-            found = grasps_on(object, GRASPS, seed)
+            grasps = grasps_on(object, GRASPS, seed)
             for arm in ARMS:
-                outcome, margin = run_arm(arm, *found, each, seed)
+                outcome, margin = run_arm(arm, *grasps, each, seed)
                 outcomes[arm.name].append(outcome)
                 margins[arm.name].append(margin)
                 progress.advance(task)
     results = {name: joined(parts) for name, parts in outcomes.items()}
-    told = {name: np.concatenate(parts) for name, parts in margins.items()}
+    found = {name: np.concatenate(parts) for name, parts in margins.items()}
     here, name = Path(__file__).parent, "margin_study_quick" if not each else "margin_study"
-    answer = text(results, told, time.perf_counter() - begun, each)
+    answer = text(results, found, time.perf_counter() - begun, each)
     (here / f"{name}.md").write_text(answer)
     write_figure(draw(results), here / f"{name}.png")
     print(answer)
