@@ -6,6 +6,7 @@ Run: python examples/04_push_at_rest.py
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rich.progress import Progress
 
 jax.config.update("jax_enable_x64", True)
 
@@ -38,7 +39,11 @@ def run(forces: list[np.ndarray], controller) -> Run:
     """All six pushes for each of the forces, all at once."""
     lanes = 6 * len(forces)
     push = Push(wrench=np.tile(pushes, (len(forces), 1)), begin=BEGIN)
-    return sim.run(np.tile(sim.around, (lanes, 1)), np.repeat(forces, 6, 0), controller, push, SECONDS)
+    with Progress(transient=True) as bar:
+        task = bar.add_task(f"simulating {lanes} pushes", total=round(1e3 * SECONDS))
+        seen = lambda step: bar.update(task, completed=step)  # noqa: E731
+        start = np.tile(sim.around, (lanes, 1))
+        return sim.run(start, np.repeat(forces, 6, 0), controller, push, SECONDS, progress=seen)
 
 
 def tell(name: str, part: Run) -> None:
@@ -47,7 +52,7 @@ def tell(name: str, part: Run) -> None:
     held = f"held {int((~part.lost).sum())} of 6, moved {1e3 * part.peak.max():7.2f} mm"
     end = f"in the end {1e3 * away[-1].max():7.3f} mm and {np.degrees(angle[-1].max()):.3f} degrees off"
     slip, loss = 1e3 * part.worst_slip().max(), 1e3 * part.longest_loss().max()
-    print(f"{name:38s} {held}, {end}, slip {slip:6.3f} mm, contact lost for {loss:3.0f} ms")
+    print(f"{name:42s} {held}, {end}, slip {slip:6.3f} mm, contact lost for {loss:3.0f} ms")
 
 
 shown = {}

@@ -6,6 +6,7 @@ Run: python examples/05_push_in_motion.py
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rich.progress import Progress
 
 jax.config.update("jax_enable_x64", True)
 
@@ -36,7 +37,10 @@ runs = {}
 for name, controller in (("computed torque", ComputedTorque()), ("optimisation, w = 0.1", optimisation)):
     # Anew from where the ball is 0.12 s after it was found more than 0.3 mm off, once the push is over.
     for variant, replan in (("path kept", None), ("path begun anew", (3e-4, 0.12))):
-        run = sim.run(start, tightening, controller, push, SECONDS, path=path, replan=replan)
+        with Progress(transient=True) as bar:
+            task = bar.add_task(f"{name}, {variant}", total=round(1e3 * SECONDS))
+            seen = lambda step, bar=bar, task=task: bar.update(task, completed=step)  # noqa: E731
+            run = sim.run(start, tightening, controller, push, SECONDS, path=path, replan=replan, progress=seen)
         runs[f"{name}, {variant}"] = run
         off = np.linalg.norm(run.position[-1] - goal[:, :3], axis=-1)
         far = np.linalg.norm(run.position - run.position[:, 1:], axis=-1)[:, 0].max()

@@ -229,6 +229,28 @@ def test_lanes_have_friction_of_their_own_and_leave_each_other_alone(sim, plan, 
     assert np.isfinite(run.position).all()
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"qpos": np.zeros((2, 18))}, r"qpos: got shape \(2, 18\), wanted \(2, 19\)"),
+        ({"tightening": np.full((2, 4, 3), np.nan)}, r"tightening: lanes \[0, 1\] are not finite.*22"),
+        ({"push": Push(wrench=np.zeros((3, 6)), begin=0.0)}, r"push: got shape \(3, 6\), wanted \(2, 6\)"),
+        ({"path": Path.rest(1)}, r"path: got shape \(1, 6, 6\)"),
+        ({"friction": np.array([0.5, -1.0])}, r"friction: lanes \[1\] are not positive"),
+    ],
+)
+def test_what_does_not_fit_is_named(sim, plan, changes, words):
+    given = {
+        "qpos": np.tile(sim.around, (2, 1)),
+        "tightening": np.tile(plan[1], (2, 1, 1)),
+        "controller": ComputedTorque(),
+        "push": Push(wrench=np.zeros((2, 6)), begin=0.0),
+        "seconds": 0.01,
+    }
+    with pytest.raises(ValueError, match=words):
+        sim.run(**(given | changes))
+
+
 def test_figures_and_movie(tight, loose, sim, tmp_path):
     for figure in (figure_of_pushes({"a": tight, "b": loose}, "xz"), figure_of_motions({"a": tight}, "xz")):
         figure.savefig(tmp_path / "figure.png")

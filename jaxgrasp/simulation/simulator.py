@@ -134,20 +134,25 @@ class Simulator:
 
         Returns:
             The course of all lanes.
+
+        Raises:
+            ValueError: Shapes that do not fit, or configurations, forces or friction that are no finite numbers.
         """
-        qpos, lanes, model = np.asarray(qpos, float), len(qpos), self.hand.model
+        qpos, tightening, model = np.asarray(qpos, float), np.asarray(tightening, float), self.hand.model
+        lanes = len(qpos)
         path = Path.rest(lanes) if path is None else path
         impedance = Impedance() if impedance is None else impedance
+        given = {"qpos": qpos, "tightening": tightening, "push": push.wrench, "path": path.coefficients}
+        _check(model, lanes, given | ({} if friction is None else {"friction": np.asarray(friction, float)}))
         begun = self.grasps(qpos)
         origin, turned = np.asarray(begun.object_position), np.asarray(begun.object_rotation)
-        tightening = np.asarray(tightening, float)
         engaged, forces = np.any(tightening != 0, -1), tightening.reshape(lanes, -1)
         state = np.zeros((lanes, mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))))
         state[:, 1 : 1 + model.nq] = qpos
-        given = np.zeros((lanes, 1, model.nu + 6 * model.nbody))
+        controls = np.zeros((lanes, 1, model.nu + 6 * model.nbody))
         wrench = model.nu + 6 * self.hand.object_body + np.arange(6)
         posture = qpos[:, model.jnt_qposadr[self.hand.joints]]
-        seen, again = np.full(lanes, np.inf), np.zeros(lanes, bool)
+        replanning = None if replan is None else _Replanning(lanes, *replan)
         course: list[tuple] = []
         models, step = self._models(friction, lanes), model.opt.timestep
         with rollout.Rollout(nthread=len(self._data)) as pool:
@@ -160,21 +165,15 @@ class Simulator:
                 torque, commanded = _answered(controller, measured, goal)
                 measured, torque, commanded = jax.tree.map(np.asarray, (measured, torque, commanded))
                 posture = posture + step * np.asarray(along)
-                given[:, 0, : model.nu], given[:, 0, wrench] = torque, push.at(time)
-                states, sensed = pool.rollout(models, self._data, state, given, control_spec=_GIVEN)
+                controls[:, 0, : model.nu], controls[:, 0, wrench] = torque, push.at(time)
+                states, sensed = pool.rollout(models, self._data, state, controls, control_spec=_GIVEN)
                 state = states[:, 0]
                 there = np.concatenate(
                     [measured.position - origin, _rotation_vectors(measured.rotation @ turned.swapaxes(-1, -2))], -1
                 )
                 course.append((time, now, there, place, measured.sliding, sensed[:, 0], commanded))
-                if replan is not None:
-                    far = np.linalg.norm(there[:, :3] - place[:, :3], axis=-1) > replan[0]
-                    seen = np.where(far & np.isinf(seen), time, seen)
-                    due = (time >= seen + replan[1]) & ~again
-                    again |= due
-                    if due.any():
-                        end = np.maximum(path.begin + path.duration, time + _SHORTEST)
-                        path = path.replaced(due, Path.to(path.goal, np.full(lanes, time), end, there, speed))
+                if replanning is not None:
+                    path = replanning.path(path, time, there, place, speed)
                 if progress is not None:
                     progress(number + 1)
         time, qpos, there, place, sliding, sensed, commanded = map(np.array, zip(*course, strict=True))
@@ -217,6 +216,45 @@ class Simulator:
             return state, *goal_of(impedance, state, wanted, tightening, posture, limit)
 
         return measured
+
+
+class _Replanning:
+    """Gives each lane a new path once, a while after its object was found too far from the old one."""
+
+    def __init__(self, lanes: int, distance: float, delay: float):
+        self._distance, self._delay = distance, delay
+        self._seen, self._done = np.full(lanes, np.inf), np.zeros(lanes, bool)
+
+    def path(self, path: Path, time: float, there: np.ndarray, place: np.ndarray, speed: np.ndarray) -> Path:
+        """The path from now on; there, place and speed are where the object is and should be, and how fast."""
+        far = np.linalg.norm(there[:, :3] - place[:, :3], axis=-1) > self._distance
+        self._seen = np.where(far & np.isinf(self._seen), time, self._seen)
+        due = (time >= self._seen + self._delay) & ~self._done
+        self._done |= due
+        if not due.any():
+            return path
+        end = np.maximum(path.begin + path.duration, time + _SHORTEST)
+        return path.replaced(due, Path.to(path.goal, np.full(len(due), time), end, there, speed))
+
+
+def _check(model: mujoco.MjModel, lanes: int, given: dict[str, np.ndarray]) -> None:
+    shapes = {
+        "qpos": (lanes, model.nq),
+        "tightening": (lanes, _FINGERS, 3),
+        "push": (lanes, 6),
+        "path": (lanes, 6, 6),
+        "friction": (lanes,),
+    }
+    for name, array in given.items():
+        if np.shape(array) != shapes[name]:
+            raise ValueError(f"{name}: got shape {np.shape(array)}, wanted {shapes[name]}, one row a lane")
+        wrong = ~np.isfinite(array).reshape(lanes, -1).all(-1)
+        if name == "friction":
+            wrong |= ~(array > 0)
+        if wrong.any():
+            hint = " (forces are NaN where (22) has no answer: leave these grasps out)" if name == "tightening" else ""
+            wanted = "positive numbers" if name == "friction" else "finite numbers"
+            raise ValueError(f"{name}: lanes {np.flatnonzero(wrong)[:5].tolist()} are not {wanted}{hint}")
 
 
 @jax.jit
