@@ -187,6 +187,7 @@ def test_vmap_costs_what_the_direct_batch_costs():
     assert best["mapped"] <= VMAP_COST * best["direct"], best
 
 
+@pytest.mark.thorough
 def test_many_edges_in_more_than_one_tile():
     """XLA's CPU backend refuses a tile whose operations it finds large."""
     rng = np.random.default_rng(3)

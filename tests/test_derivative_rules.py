@@ -146,6 +146,7 @@ def test_one_compliance_a_direction_needs_a_sharp_set():
         jg.largest_disturbance(contacts_on_ball(ball_grasps(2)), FORCES.smoothed(0.1), compliance=every)
 
 
+@pytest.mark.thorough
 def test_single_precision_gradients_are_finite():
     rng = np.random.default_rng(6)
     directions, axes = problems.unit_vectors(rng, 100_000, 4), rng.uniform(0.02, 0.06, (100_000, 1, 3))

@@ -141,6 +141,7 @@ def test_the_answer_is_the_blocking_force(plan, on_the_way):
     np.testing.assert_allclose(forces - goal.tightening, truth, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_optimisation_is_the_computed_torque_where_only_motion_counts(on_the_way):
     state, goal = on_the_way
     # What is left of the other goals is of the order of 1 / w.
