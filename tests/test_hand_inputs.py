@@ -233,3 +233,15 @@ def test_hidden_moment_arms_and_limits_of_tendons_and_joints():
     assert HandObject.from_mjcf(model, "object").actuator_names == ("t",)
     # A limit of a joint that nothing drives binds nothing.
     HandObject.from_mjcf(finger('<actuator><motor name="a" joint="a"/></actuator>', links=LIMITED), "object")
+
+
+def test_a_fixed_object_does_not_touch_a_fixed_palm():
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+      <body name="palm"><geom type="box" size=".05 .05 .01"/>
+        <body name="finger" pos="0 0 .04"><joint axis="0 1 0"/><geom type="sphere" size=".01"/></body></body>
+      <body name="object" pos="0 0 .03"><geom type="sphere" size=".03"/></body>
+    </worldbody></mujoco>""")
+    hand, data = HandObject.from_mjcf(model, "object"), mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert hand.slot_links.tolist() == [model.body("finger").id]
+    assert data.ncon == 1

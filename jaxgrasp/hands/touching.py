@@ -195,7 +195,9 @@ def _pairs(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> dict[
         for o in of_object.tolist():
             bodies = tuple(sorted((int(model.geom_bodyid[g]), int(model.geom_bodyid[o]))))
             meet = model.geom_contype[g] & model.geom_conaffinity[o] | model.geom_contype[o] & model.geom_conaffinity[g]
-            if meet and bodies not in excluded:
+            # What is fixed to the same body, the world for example, does not collide.
+            moving = model.body_weldid[bodies[0]] != model.body_weldid[bodies[1]]
+            if meet and moving and bodies not in excluded:
                 friction[g, o] = _combined_friction(model, g, o)
     # Pairs that are spelt out count whatever the masks say.
     for one, other, values in zip(model.pair_geom1, model.pair_geom2, model.pair_friction, strict=True):
