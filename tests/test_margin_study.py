@@ -41,10 +41,10 @@ def test_a_push_of_the_directional_margin_just_holds():
 def test_weak_pushes_are_held_and_strong_ones_are_not(monkeypatch):
     monkeypatch.setattr(margin_study, "STRENGTHS", np.array([0.0, 0.5, 4.0]))
     found = margin_study.grasps_on("sphere", 6, seed=0)
-    outcome, margin = margin_study.run_arm(margin_study.ARMS[0], *found, False, 0)
+    outcome, margin = margin_study.run_arm(margin_study.ARMS[0], *found, 0)
     assert margin.shape == (6,) and margin.min() > margin_study.LEAST
     held = outcome.held.reshape(6, 3)
     assert held[:, :2].mean() > 0.9 and held[:, 2].mean() < 0.5
     assert np.all(outcome.stands.reshape(6, 3) == held[:, :1])
-    words = margin_study.text({"one": outcome}, {"one": margin}, 60.0, False)
+    words = margin_study.text({"one": outcome}, {"one": margin}, 60.0)
     assert "| 4 | " in words and "all below 0.9" in words
