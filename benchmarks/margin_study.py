@@ -240,10 +240,12 @@ def text(results: dict[str, Outcome], margins: dict[str, np.ndarray], seconds: f
         "# Is the margin true?",
         "",
         wrapped(
-            f"{count} random grasps of the torque-driven four-finger hand, {count // len(OBJECTS)} on each of {', '.join(OBJECTS)}, "
+            f"{count} random grasps of the torque-driven four-finger hand, {count // len(OBJECTS)} on each of "
+            f"{', '.join(OBJECTS)}, "
             f"half of them with three fingertips and half with four, friction from {min(FRICTIONS)} to "
             f"{max(FRICTIONS)}, no gravity, margins (21) of at least {LEAST} N under six unit forces with at most 2 N "
-            f"a finger. In C MuJoCo each is pushed for {PUSHED:g} s by 0 to 2 times its margin along one of six axes, drawn anew every time. Held: "
+            f"a finger. In C MuJoCo each is pushed for {PUSHED:g} s by 0 to 2 times its margin along one of six axes, drawn "
+            "anew every time. Held: "
             f"never farther than 1 cm from its place, and all fingers on the object {AFTER:g} s after the push. f_0 is "
             "that of "
             f"(22) at {SHARE:g} of the margin; untightened, all fingers press alike, as hard in the mean as f_0. Q "
