@@ -204,6 +204,11 @@ def below(outcome: Outcome, which: np.ndarray) -> str:
     return told(outcome.held[(which < SAFE) & (outcome.push > 0) & outcome.stands])
 
 
+def bins(outcome: Outcome) -> np.ndarray:
+    """The place of every push among `BOUNDS`; infinite where the forces at rest already pass a facet."""
+    return np.minimum(np.digitize(outcome.directional, BOUNDS) - 1, len(BOUNDS) - 2)
+
+
 def draw(results: dict[str, Outcome]) -> Figure:
     """Share that holds over the push over the margin, and over the directional margin."""
     figure = Figure(figsize=(11.0, 4.2), layout="constrained", dpi=150)
@@ -212,8 +217,8 @@ def draw(results: dict[str, Outcome]) -> Figure:
         style = {"label": name, "color": f"C{number}", "marker": "o", "ms": 3.5, "lw": 1.2, "capsize": 2}
         _curve(axes[0], o.push, o.held, np.unique(o.push), style)
         middle = np.append((BOUNDS[:-2] + BOUNDS[1:-1]) / 2, BOUNDS[-2] + 0.15)
-        place = middle[np.clip(np.digitize(o.directional, BOUNDS) - 1, 0, len(middle) - 1)]
-        _curve(axes[1], place[o.stands], o.held[o.stands], middle, style)
+        counted = o.stands & (o.push > 0)
+        _curve(axes[1], middle[bins(o)][counted], o.held[counted], middle, style)
     axes[0].set(xlabel="push / margin of (21)", ylabel="share that holds", ylim=(-0.02, 1.02))
     axes[1].set(xlabel="push / largest push in its direction, given the forces at rest")
     axes[1].axvline(1.0, color="0.7", lw=0.8)
@@ -271,12 +276,10 @@ def text(results: dict[str, Outcome], margins: dict[str, np.ndarray], seconds: f
         "| push / directional margin | " + " | ".join(results) + " |",
         "|---" * (len(results) + 1) + "|",
     ]
-    for low, high in zip(BOUNDS[:-1], BOUNDS[1:], strict=True):
-        row = [
-            told(o.held[(low <= o.directional) & (o.directional < high) & o.stands & (o.push > 0)])
-            for o in results.values()
-        ]
-        lines.append(f"| {low:g} to {high:g} | " + " | ".join(row) + " |")
+    for place, low in enumerate(BOUNDS[:-1]):
+        row = [told(o.held[(bins(o) == place) & o.stands & (o.push > 0)]) for o in results.values()]
+        name = f"{low:g} to {BOUNDS[place + 1]:g}" if place + 2 < len(BOUNDS) else f"{low:g} and more"
+        lines.append(f"| {name} | " + " | ".join(row) + " |")
     lines.append(f"| all below {SAFE:g} | " + " | ".join(below(o, o.directional) for o in results.values()) + " |")
     lines.append(
         f"| all below {SAFE:g} of that with Q = I | " + " | ".join(below(o, o.other) for o in results.values()) + " |"
