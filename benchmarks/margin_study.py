@@ -21,6 +21,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.progress import Progress
+from scipy.stats import binomtest
 
 jax.config.update("jax_enable_x64", True)
 
@@ -181,10 +182,8 @@ def run_arm(
 
 def interval(held: int, count: int) -> tuple[float, float]:
     """Wilson's, 95 %."""
-    z = 1.96
-    share, spread = held / count, z * np.sqrt(held * (count - held) / count + z * z / 4) / (count + z * z)
-    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
-    return centre - spread, centre + spread
+    found = binomtest(held, count).proportion_ci(method="wilson")
+    return found.low, found.high
 
 
 def told(held: np.ndarray) -> str:

@@ -135,7 +135,7 @@ def _blocking(state: State, wrench: Array, compliance: Array | None) -> Float[Ar
 
 
 def _solve(matrix: Array, right: Array) -> Array:
-    """For positive definite matrices: less than half as long as `jnp.linalg.solve`."""
+    """For positive definite matrices."""
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix, symmetrize_input=False), True), right)
 
 

@@ -28,7 +28,6 @@ def write_movie(
     begin: float = 0.0,
     end: float = np.inf,
     slower: float = 1.0,
-    progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Renders lanes of runs beside each other and writes them as an animated GIF; pushes are red arrows.
 
@@ -39,7 +38,6 @@ def write_movie(
         begin: Of what is shown, s.
         end: s.
         slower: How many times slower than in the world.
-        progress: Called with the number of frames done and their number.
 
     Raises:
         RuntimeError: No OpenGL context can be had; the message names the remedy.
@@ -54,11 +52,9 @@ def write_movie(
     mujoco.mj_forward(model, data)
     centre = data.body("object").xipos.copy()
     with offscreen(model, _PIXELS, _PIXELS) as render:
-        for number, step in enumerate(steps):
+        for step in steps:
             panels = [_panel(model, data, render, run, lane, step, centre) for _, run, lane in runs]
             frames.append(_labelled(panels, [title for title, _, _ in runs], time[step]))
-            if progress is not None:
-                progress(number + 1, len(steps))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1e3 * _FRAME), loop=0, optimize=True)
 
 
