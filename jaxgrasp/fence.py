@@ -20,6 +20,7 @@ T = TypeVar("T")
 U = TypeVar("U")
 
 _fences = contextvars.ContextVar("fences", default=False)
+_loops = contextvars.ContextVar("loops", default=False)
 
 
 @contextlib.contextmanager
@@ -30,6 +31,17 @@ def fences(on: bool) -> Iterator[None]:
         yield
     finally:
         _fences.reset(token)
+
+
+@contextlib.contextmanager
+def loops() -> Iterator[None]:
+    """Without fences, but with loops as loops: for compilers that choose themselves which to spell out."""
+    tokens = _fences.set(False), _loops.set(True)
+    try:
+        yield
+    finally:
+        _fences.reset(tokens[0])
+        _loops.reset(tokens[1])
 
 
 def fenced(function: Callable[P, T]) -> Callable[P, T]:
@@ -52,7 +64,7 @@ def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
     """
     if count == 1:
         return step(jnp.zeros((), jnp.int32), state)
-    return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() else True)
+    return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() or _loops.get() else True)
 
 
 def each(function: Callable[[T], U], parts: T) -> U:

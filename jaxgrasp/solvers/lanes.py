@@ -6,6 +6,7 @@ CPUs the lanes are cut into tiles that stay in the cache; elsewhere they go at o
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from jaxgrasp import kernels
 from jaxgrasp.fence import fences
 
 Tree = Any
@@ -100,9 +102,10 @@ def tiled(
     """`map_lanes` of leaves, without a rule for `jax.vmap`; rows are 0 where tiles cannot be compact."""
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
 
+    first = lambda last: stages[0](jax.tree.unflatten(structure, last))  # noqa: E731
+
     def enter(parts: list[jax.Array]) -> Tree:
-        last = [x[..., None] if s else jnp.moveaxis(x, 0, -1) for x, s in zip(parts, shared, strict=True)]
-        return stages[0](jax.tree.unflatten(structure, last))
+        return first([x[..., None] if s else jnp.moveaxis(x, 0, -1) for x, s in zip(parts, shared, strict=True)])
 
     def leave(value: Tree) -> Tree:
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), value)
@@ -111,9 +114,7 @@ def tiled(
     steps[-1] = lambda value, last=steps[-1]: leave(last(value))
 
     def solve(value: Tree) -> Tree:
-        for step in steps:
-            value = step(value)
-        return value
+        return _in_turn(steps, value)
 
     def in_tiles(tile: int, one: Callable) -> Tree:
         count = math.ceil(lanes / tile)
@@ -131,6 +132,10 @@ def tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
+        fused = kernels.call(partial(_in_turn, (first, *stages[1:])), leaves, shared)
+        return in_compact_tiles() if fused is None else fused
+
+    def in_compact_tiles() -> Tree:
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
         largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
         compact = rows > 0 and lanes > size and largest <= LARGEST_LEAF
@@ -153,6 +158,12 @@ def tiled(
     if jax.default_backend() == "cpu":
         return on_cpu()
     return lax.platform_dependent(cpu=on_cpu, default=elsewhere)
+
+
+def _in_turn(steps: Sequence[Callable[[Tree], Tree]], value: Tree) -> Tree:
+    for step in steps:
+        value = step(value)
+    return value
 
 
 def _as_one_function(step: Callable[[Tree], Tree], value: Tree) -> Tree:

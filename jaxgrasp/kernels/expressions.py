@@ -1,0 +1,200 @@
+"""Scalar expressions: what a fused kernel computes, one problem at a time.
+
+A `Value` is one operation on other values or constants. Equal operations are the same value, operations on constants
+are done at once, and a value belongs to the outermost region (a loop's body, say) that knows its operands: what does
+not change in a loop is computed before it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Constant = np.floating | np.integer | np.bool_
+Scalar = "Value | Constant"
+
+
+class Region:
+    """Code that runs as a whole: a kernel, the body of a loop, or what only some problems need.
+
+    steps: what it does beside computing values (loops, stores), in order.
+    guarded: values stay inside even where they could be computed outside.
+    """
+
+    def __init__(self, parent: "Region | None", guarded: bool = False) -> None:
+        self.parent, self.guarded = parent, guarded
+        self.depth: int = 0 if parent is None else parent.depth + 1
+        self.steps: list[Any] = []
+        self.known: dict[tuple, Value] = {}
+
+
+class Value:
+    """A scalar that is computed: an operation, its operands, its type and its region.
+
+    Types: "f" a number, "i" an integer and "b" a truth value of every problem; "u" an integer that all problems share.
+    """
+
+    __slots__ = ("args", "kind", "op", "region", "serial")
+    count = 0
+
+    def __init__(self, op: str, args: tuple, kind: str, region: Region) -> None:
+        self.op, self.args, self.kind, self.region = op, args, kind, region
+        self.serial = Value.count = Value.count + 1
+
+
+_COMMUTE = {"add", "mul", "max", "min", "and", "or", "eq", "ne"}
+_COMPARE = {"eq", "ne", "lt", "le", "gt", "ge"}
+_FOLD: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "max": np.maximum,
+    "min": np.minimum,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "floor": np.floor,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.invert,
+    "is_finite": np.isfinite,
+}
+
+
+def kind_of(dtype: Any) -> str:
+    """The type of a scalar of this dtype."""
+    kinds = {"f": "f", "i": "i", "b": "b", "u": "i"}
+    return kinds[np.dtype(dtype).kind]
+
+
+class Builder:
+    """Makes values, in the region that is current."""
+
+    def __init__(self, dtype: Any) -> None:
+        self.dtype = np.dtype(dtype)
+        self.region = Region(None)
+
+    def make(self, op: str, *args: Any) -> Any:
+        """The value of an operation, or the constant where that is known."""
+        if not any(type(x) is Value for x in args):
+            with np.errstate(all="ignore"):
+                return self._constant(op, args)
+        simple = self._simplified(op, args)
+        if simple is not None:
+            return simple
+        if op in _COMMUTE and _order(args[0]) > _order(args[1]):
+            args = args[::-1]
+        if op in _COMPARE or op == "is_finite":
+            # Counters count up from zero.
+            if op == "lt" and _kind(args[0]) == "u" and type(args[1]) is not Value and args[1] == 0:
+                return np.bool_(False)
+            kind = "b"
+        elif op == "select":
+            kind = next(_kind(x) for x in args[1:])
+        else:
+            kind = next(_kind(x) for x in args if type(x) is Value)
+        return self.value(op, args, kind)
+
+    def value(self, op: str, args: tuple, kind: str) -> Value:
+        """A value that is not simplified."""
+        key = (op, kind, *[id(x) if type(x) is Value else _bits(x) for x in args])
+        home = self._home(args)
+        region: Region | None = self.region
+        while region is not None:
+            found = region.known.get(key)
+            if found is not None:
+                return found
+            region = region.parent
+        found = home.known[key] = Value(op, args, kind, home)
+        return found
+
+    def _home(self, args: tuple) -> Region:
+        home, region = None, self.region
+        for x in args:
+            if type(x) is Value and (home is None or x.region.depth > home.depth):
+                home = x.region
+        # The outermost region is the kernel's; guarded ones keep what is made in them.
+        while region is not None:
+            if region is home or region.guarded or region.parent is None:
+                return region
+            region = region.parent
+        raise AssertionError
+
+    def _constant(self, op: str, args: tuple) -> Any:
+        if op == "select":
+            return args[1] if args[0] else args[2]
+        if op == "rsqrt":
+            return (1 / np.sqrt(args[0])).astype(args[0].dtype)
+        return _FOLD[op](*args)
+
+    def _simplified(self, op: str, args: tuple) -> Any:
+        """Cheaper forms; a product with zero is zero, whatever the other factor."""
+        if op in ("add", "sub", "mul", "div"):
+            a, b = args
+            left, right = type(a) is not Value, type(b) is not Value
+            if op == "mul":
+                for x, y, known in ((a, b, left), (b, a, right)):
+                    if known and x in (0, 1, -1):
+                        return x * x.dtype.type(0) if x == 0 else y if x == 1 else self.make("neg", y)
+                if type(a) is Value and type(b) is Value and a.op == b.op == "neg":
+                    return self.make("mul", a.args[0], b.args[0])
+            elif op == "add":
+                if left and a == 0:
+                    return b
+                if right and b == 0:
+                    return a
+                if not right and b.op == "neg":
+                    return self.make("sub", a, b.args[0])
+                if not left and a.op == "neg":
+                    return self.make("sub", b, a.args[0])
+            elif op == "sub":
+                if right and b == 0:
+                    return a
+                if left and a == 0:
+                    return self.make("neg", b)
+                if not right and b.op == "neg":
+                    return self.make("add", a, b.args[0])
+            elif right and b != 0 and np.isfinite(b) and b.dtype.kind == "f":
+                return self.make("mul", a, (1 / b).astype(b.dtype))
+        elif op == "neg" and args[0].op == "neg":
+            return args[0].args[0]
+        elif op == "neg" and args[0].op == "sub":
+            return self.make("sub", args[0].args[1], args[0].args[0])
+        elif op == "not" and args[0].op == "not":
+            return args[0].args[0]
+        elif op in ("and", "or"):
+            for x, y in (args, args[::-1]):
+                if type(x) is not Value:
+                    return (y if x else x) if op == "and" else (x if x else y)
+            if args[0] is args[1]:
+                return args[0]
+        elif op == "select":
+            if type(args[0]) is not Value:
+                return args[1] if args[0] else args[2]
+            if args[1] is args[2]:
+                return args[1]
+        elif op in ("max", "min") and args[0] is args[1]:
+            return args[0]
+        return None
+
+
+def _kind(x: Any) -> str:
+    return x.kind if type(x) is Value else kind_of(x.dtype)
+
+
+def _order(x: Any) -> int:
+    return x.serial if type(x) is Value else 0
+
+
+def _bits(x: Any) -> Any:
+    return (x.dtype.char, x.tobytes()) if isinstance(x, np.generic) else x

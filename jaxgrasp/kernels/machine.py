@@ -1,0 +1,129 @@
+"""LLVM for the processor at hand, and the folder in which compiled kernels are kept."""
+
+import ctypes
+import functools
+import hashlib
+import os
+import stat
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Unavailable(Exception):
+    """Why there are no fused kernels here."""
+
+
+class Machine(NamedTuple):
+    """A processor.
+
+    target: LLVM's target machine.
+    vector_bytes: size of a vector register.
+    estimates: whether it has AVX-512's estimates of reciprocals.
+    description: everything that compiled code depends on.
+    """
+
+    target: Any
+    vector_bytes: int
+    estimates: bool
+    description: str
+
+
+@functools.cache
+def machine() -> Machine:
+    """The processor at hand.
+
+    Raises:
+        Unavailable: no llvmlite, or a processor without fused multiply-add.
+    """
+    if os.name != "posix":
+        raise Unavailable("this operating system is not supported")
+    try:
+        import llvmlite
+        import llvmlite.binding as llvm
+    except ImportError:
+        raise Unavailable("llvmlite is not installed; pip install 'jaxgrasp[fast]'") from None
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    try:
+        name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features()
+        triple = llvm.get_process_triple()
+        wide = all(features.get(f, False) for f in ("avx512f", "avx512dq", "avx512vl"))
+        if not (features.get("fma", False) or triple.startswith(("aarch64", "arm64"))):
+            raise Unavailable(f"the processor {name or 'at hand'} has no fused multiply-add")
+        flags = features.flatten() + (",-prefer-256-bit" if wide else "")
+        # The lower level compiles faster, and code here has been put in order already.
+        target = llvm.Target.from_triple(triple).create_target_machine(cpu=name, features=flags, opt=1)
+    except RuntimeError as error:
+        raise Unavailable(f"LLVM does not know the processor: {error}") from None
+    size = 64 if wide else 32 if features.get("avx2", False) else 16
+    return Machine(target, size, wide, f"{llvmlite.__version__} {triple} {name} {flags}")
+
+
+def compiled(code: str) -> bytes:
+    """Object code of a module.
+
+    Raises:
+        RuntimeError: LLVM does not accept it.
+    """
+    import llvmlite.binding as llvm
+
+    module = llvm.parse_assembly(code)
+    module.triple = llvm.get_process_triple()
+    return machine().target.emit_object(module)
+
+
+_engines: list[Any] = []
+
+
+def loaded(objects: bytes, name: str) -> int:
+    """Address of a function in object code, which stays loaded."""
+    import llvmlite.binding as llvm
+
+    empty = llvm.parse_assembly("")
+    empty.triple = llvm.get_process_triple()
+    target = llvm.Target.from_triple(empty.triple).create_target_machine()
+    engine = llvm.create_mcjit_compiler(empty, target)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(objects))
+    engine.finalize_object()
+    _engines.append(engine)
+    return engine.get_function_address(name)
+
+
+def capsule(address: int) -> Any:
+    """A function pointer as XLA takes it."""
+    new = ctypes.pythonapi.PyCapsule_New
+    new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
+    return new(address, None, None)
+
+
+def cached(key: str) -> bytes | None:
+    """Object code that was kept, if it is whole; what others could have written is not trusted."""
+    try:
+        folder = _folder()
+        own = folder.stat()
+        if own.st_uid != os.getuid() or own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            return None
+        content = (folder / key).read_bytes()
+    except OSError:
+        return None
+    digest, objects = content[:32], content[32:]
+    return objects if hashlib.sha256(objects).digest() == digest else None
+
+
+def keep(key: str, objects: bytes) -> None:
+    """Keep object code.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    folder = _folder()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+        file.write(hashlib.sha256(objects).digest() + objects)
+    os.replace(file.name, folder / key)
+
+
+def _folder() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "jaxgrasp" / "kernels"

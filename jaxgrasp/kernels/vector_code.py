@@ -1,0 +1,433 @@
+"""LLVM code of a program: one problem per lane of a vector register.
+
+The text is written here rather than with a library's objects, which would take longer than LLVM takes to compile it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxgrasp.kernels.expressions import Value
+from jaxgrasp.kernels.lowering import Guard, Loop
+from jaxgrasp.kernels.registers import Registers
+from jaxgrasp.kernels.schedule import Schedule, in_memory
+
+_INTEGERS = {"add": "add", "sub": "sub", "mul": "mul"}
+_FLOATS = {"add": "fadd", "sub": "fsub", "mul": "fmul"}
+_FLOAT_CONDITIONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
+_INTEGER_CONDITIONS = {"eq": "eq", "ne": "ne", "lt": "slt", "le": "sle", "gt": "sgt", "ge": "sge"}
+_INTRINSICS = {"sqrt": "sqrt", "exp": "exp", "log": "log", "floor": "floor", "abs": "fabs"}
+
+
+class VectorCode:
+    """Writes instructions.
+
+    Args:
+        dtype: of numbers.
+        width: lanes of a vector.
+        estimates: whether the processor has AVX-512's estimates of reciprocals.
+    """
+
+    def __init__(self, dtype: np.dtype, width: int, *, estimates: bool) -> None:
+        self.dtype, self.width, self.estimates = dtype, width, estimates
+        self.scalar = "double" if dtype.itemsize == 8 else "float"
+        self.types = {"f": f"<{width} x {self.scalar}>", "i": f"<{width} x i32>", "b": f"<{width} x i1>", "u": "i64"}
+        self.types["byte"] = f"<{width} x i8>"
+        self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
+        self.lines: list[str] = []
+        self.allocations: list[str] = []
+        self.declarations: set[str] = set()
+        self.block = "entry"
+        self.count = 0
+        self.own: list[str] = []
+        self.shared: list[str] = []
+        self.fused: set[Value] = set()
+        self.slots: dict[Loop | Guard, list[str]] = {}
+        self.labels: dict[Loop | Guard, tuple[str, str, str]] = {}
+        self.masks: dict[Loop, str] = {}
+        self.counters: dict[Loop, tuple[str, str, int]] = {}
+        self.carried: dict[Value, tuple[Loop, int]] = {}
+        self.homes: set[Value] = set()
+
+    # Instructions
+
+    def emit(self, text: str) -> str:
+        """An instruction with a result."""
+        self.count += 1
+        name = f"%v{self.count}"
+        self.lines.append(f"{name} = {text}")
+        return name
+
+    def do(self, text: str) -> None:
+        """An instruction without one."""
+        self.lines.append(text)
+
+    def label(self, purpose: str) -> str:
+        self.count += 1
+        return f"{purpose}{self.count}"
+
+    def enter(self, block: str) -> None:
+        self.lines.append(f"{block}:")
+        self.block = block
+
+    def allocate(self, kind: str, count: int = 1) -> str:
+        """Memory on the stack for vectors."""
+        self.count += 1
+        name = f"%m{self.count}"
+        stored = f"[{count} x {self.types[kind]}]"
+        self.allocations.append(f"{name} = alloca {stored}, align 64")
+        return name
+
+    def declare(self, text: str) -> None:
+        self.declarations.add(text)
+
+    def entry(self, base: str, unit: str, index: str | int) -> str:
+        """Address of an entry."""
+        return self.emit(f"getelementptr {unit}, ptr {base}, i64 {index}")
+
+    def repeat(self, count: int | str, body: Callable[[str], None]) -> None:
+        """`body(number)` so many times, at least once."""
+        before, inside, after = self.block, self.label("repeat"), self.label("after")
+        self.do(f"br label %{inside}")
+        self.enter(inside)
+        self.count += 1
+        number, place = f"%n{self.count}", len(self.lines)
+        self.do("")
+        body(number)
+        following = self.emit(f"add i64 {number}, 1")
+        self.lines[place] = f"{number} = phi i64 [ 0, %{before} ], [ {following}, %{self.block} ]"
+        again = self.emit(f"icmp ult i64 {following}, {count}")
+        self.do(f"br i1 {again}, label %{inside}, label %{after}")
+        self.enter(after)
+
+    def constant(self, value: Any, kind: str) -> str:
+        """A literal."""
+        if kind == "f":
+            return f"splat ({self.scalar} {self.float_literal(value)})" if self.width > 1 else self.float_literal(value)
+        if kind == "b":
+            return f"splat (i1 {'true' if value else 'false'})"
+        return str(int(value)) if kind == "u" else f"splat (i32 {int(value)})"
+
+    def float_literal(self, value: Any) -> str:
+        return f"0x{np.float64(self.dtype.type(value)).view(np.uint64):016X}"
+
+    def operand(self, x: Any, kind: str) -> str:
+        """The name or literal of a scalar."""
+        if type(x) is not Value:
+            return self.constant(x, kind)
+        name = self.registers.fetch(x)
+        if x.kind == "u" and kind != "u":
+            short = self.emit(f"trunc i64 {name} to i32")
+            one = self.emit(f"insertelement {self.types['i']} poison, i32 {short}, i64 0")
+            return self.emit(f"shufflevector {self.types['i']} {one}, {self.types['i']} poison, <{self.width} x i32> zeroinitializer")
+        return name
+
+    # Events
+
+    def follow(self, schedule: Schedule, result: Callable[[int, str], None], registers: int) -> None:
+        """Write a whole program.
+
+        Args:
+            schedule: its events.
+            result: told the number and the name of every result.
+            registers: vector registers for values.
+        """
+        self.fused = schedule.fused
+        self.registers = Registers(self, schedule, registers)
+        for number, event in enumerate(schedule.events):
+            if event.what == "compute":
+                self.compute(event.subject, number)
+            elif event.what == "store":
+                result(event.subject, self.registers.fetch(event.uses[0]) if event.uses else "")
+            elif event.what == "test":
+                self.masks[event.subject] = self.operand(event.subject.condition, "b")
+                self.branch_if_any(self.masks[event.subject], event.subject)
+            elif isinstance(event.subject, Loop):
+                (self.enter_loop if event.what == "enter" else self.leave_loop)(event.subject, number)
+            else:
+                (self.enter_guard if event.what == "enter" else self.leave_guard)(event.subject, number)
+            self.registers.passed(number)
+
+    def compute(self, value: Value, number: int) -> None:
+        """A value; the next value of something carried takes its place where nobody needs the old one any more."""
+        name = self.instruction(value)
+        place = None
+        carried = self.carried.get(value)
+        if carried is not None:
+            loop, index = carried
+            if self.registers.schedule.last.get(loop.carries[index], -1) <= number:
+                place = self.slots[loop][index]
+                self.store_where(self.masks.get(loop), name, place, value.kind)
+                self.homes.add(value)
+        self.registers.put(value, name, place)
+
+    def enter_loop(self, loop: Loop, number: int) -> None:
+        """Carried values live in memory."""
+        slots = self.slots[loop] = [self.allocate(kind) for kind in loop.kinds]
+        for slot, value, kind in zip(slots, loop.initial, loop.kinds, strict=True):
+            self.store(kind, self.operand(value, kind), slot)
+        for index, value in enumerate(loop.outputs):
+            if type(value) is Value and value.region is loop.body and not in_memory(value):
+                self.carried.setdefault(value, (loop, index))
+        self.registers.flush(number)
+        before, head = self.block, self.label("head")
+        self.labels[loop] = (head, self.label("body"), self.label("after"))
+        self.do(f"br label %{head}")
+        self.enter(head)
+        if loop.rounds is not None:
+            self.count += 1
+            self.counters[loop] = (f"%c{self.count}", before, len(self.lines))
+            self.do("")
+            if loop.counter is not None:
+                self.registers.put(loop.counter, self.counters[loop][0])
+
+    def leave_loop(self, loop: Loop, number: int) -> None:
+        """What has not found its place yet does, and round again."""
+        moved = []
+        for index, (value, kind) in enumerate(zip(loop.outputs, loop.kinds, strict=True)):
+            slot = self.slots[loop][index]
+            if not (value in self.homes and self.registers.places[value] == slot) and value is not loop.carries[index]:
+                moved.append((self.operand(value, kind), slot, kind))
+        for name, slot, kind in moved:
+            self.store_where(self.masks.get(loop), name, slot, kind)
+        self.registers.flush(number)
+        head, _, after = self.labels[loop]
+        if loop.rounds is None:
+            self.do(f"br label %{head}")
+        else:
+            counter, before, place = self.counters[loop]
+            following = self.emit(f"add i64 {counter}, 1")
+            self.lines[place] = f"{counter} = phi i64 [ 0, %{before} ], [ {following}, %{self.block} ]"
+            done = self.emit(f"icmp eq i64 {following}, {loop.rounds}")
+            self.do(f"br i1 {done}, label %{after}, label %{head}")
+        self.enter(after)
+
+    def enter_guard(self, guard: Guard, number: int) -> None:
+        """Code that is jumped over where no lane needs it; its results are zero then."""
+        slots = self.slots[guard] = [self.allocate(v.kind) for v in guard.results]
+        for slot, value in zip(slots, guard.results, strict=True):
+            self.store(value.kind, "zeroinitializer", slot)
+        mask = self.operand(guard.condition, "b")
+        self.registers.flush(number)
+        self.labels[guard] = ("", self.label("guarded"), self.label("after"))
+        self.branch_if_any(mask, guard)
+
+    def leave_guard(self, guard: Guard, number: int) -> None:
+        """Its results go to their places."""
+        for slot, value in zip(self.slots[guard], guard.outputs, strict=True):
+            self.store(value.kind, self.operand(value, value.kind), slot)
+        self.registers.flush(number)
+        self.do(f"br label %{self.labels[guard][2]}")
+        self.enter(self.labels[guard][2])
+
+    def branch_if_any(self, mask: str, step: Loop | Guard) -> None:
+        """Into the step where the mask holds for any lane, else past it."""
+        bits = self.emit(f"bitcast {self.types['b']} {mask} to i{self.width}")
+        some = self.emit(f"icmp ne i{self.width} {bits}, 0")
+        _, inside, after = self.labels[step]
+        self.do(f"br i1 {some}, label %{inside}, label %{after}")
+        self.enter(inside)
+
+    def store(self, kind: str, name: str, place: str) -> None:
+        """Put a vector in memory."""
+        self.do(f"store {self.types[kind]} {name}, ptr {place}, align {self.alignment(kind)}")
+
+    def load(self, kind: str, place: str) -> str:
+        """Read a vector."""
+        return self.emit(f"load {self.types[kind]}, ptr {place}, align {self.alignment(kind)}")
+
+    def alignment(self, kind: str) -> int:
+        return 1 if kind == "b" else self.width * (self.dtype.itemsize if kind == "f" else 4)
+
+    def store_where(self, mask: str | None, new: str, slot: str, kind: str) -> None:
+        """Put a vector in memory, where the mask holds."""
+        vector = self.types[kind]
+        if mask is not None and kind == "b":
+            old = self.load(kind, slot)
+            new, mask = self.emit(f"select {self.types['b']} {mask}, {vector} {new}, {vector} {old}"), None
+        if mask is None:
+            self.store(kind, new, slot)
+            return
+        name = f"@llvm.masked.store.v{self.width}{'i32' if kind == 'i' else 'f' + str(8 * self.dtype.itemsize)}.p0"
+        self.declare(f"declare void {name}({vector}, ptr, i32, {self.types['b']})")
+        aligned = f"i32 {self.alignment(kind)}"
+        self.do(f"call void {name}({vector} {new}, ptr {slot}, {aligned}, {self.types['b']} {mask})")
+
+    def read(self, value: Value) -> str:
+        """A value that lies in memory."""
+        if value.op == "own":
+            return self.load_own(value.kind, *value.args)
+        if value.op == "shared":
+            return self.load_shared(value.kind, *value.args)
+        step, index = value.args
+        return self.load(value.kind, self.slots[step][index])
+
+    # Values
+
+    def instruction(self, value: Value) -> str:
+        """The code of one value."""
+        op, args, kind = value.op, value.args, value.kind
+        vector = self.types[kind]
+        if op in _FLOAT_CONDITIONS:
+            return self.comparison(op, args)
+        if op == "is_finite":
+            size = self.intrinsic("fabs", self.operand(args[0], "f"))
+            return self.emit(f"fcmp olt {self.types['f']} {size}, {self.constant(np.inf, 'f')}")
+        if op == "select":
+            picked = [f"{vector} {self.operand(x, kind)}" for x in args[1:]]
+            return self.emit(f"select {self.types['b']} {self.operand(args[0], 'b')}, {', '.join(picked)}")
+        if op == "convert":
+            (x,) = args
+            source = "i" if x.kind == "u" else x.kind
+            how = "sitofp" if kind == "f" else "fptosi"
+            return self.emit(f"{how} {self.types[source]} {self.operand(x, source)} to {vector}")
+        fused = [x for x in args if x in self.fused]
+        if fused:
+            return self.sum_of_product(op, fused[0], args)
+        operands = [self.operand(x, kind) for x in args]
+        if kind == "b":
+            if op == "not":
+                return self.emit(f"xor {vector} {operands[0]}, splat (i1 true)")
+            return self.emit(f"{op} {vector} {', '.join(operands)}")
+        if kind in "iu":
+            return self.integer(op, vector, operands, kind)
+        return self.number(op, args, operands)
+
+    def comparison(self, op: str, args: tuple) -> str:
+        kinds = {x.kind if type(x) is Value else None for x in args} - {None}
+        kind = "f" if "f" in kinds else "b" if "b" in kinds else "i"
+        left, right = (self.operand(x, kind) for x in args)
+        how = f"fcmp {_FLOAT_CONDITIONS[op]}" if kind == "f" else f"icmp {_INTEGER_CONDITIONS[op]}"
+        return self.emit(f"{how} {self.types[kind]} {left}, {right}")
+
+    def integer(self, op: str, vector: str, operands: list[str], kind: str) -> str:
+        if op in ("max", "min"):
+            truth = "i1" if kind == "u" else self.types["b"]
+            first = self.emit(f"icmp {'sgt' if op == 'max' else 'slt'} {vector} {operands[0]}, {operands[1]}")
+            return self.emit(f"select {truth} {first}, {vector} {operands[0]}, {vector} {operands[1]}")
+        if op == "neg":
+            return self.emit(f"sub {vector} {'0' if kind == 'u' else 'zeroinitializer'}, {operands[0]}")
+        return self.emit(f"{_INTEGERS[op]} {vector} {', '.join(operands)}")
+
+    def number(self, op: str, args: tuple, operands: list[str]) -> str:
+        vector = self.types["f"]
+        if op in _FLOATS:
+            return self.emit(f"{_FLOATS[op]} {vector} {', '.join(operands)}")
+        if op == "neg":
+            return self.emit(f"fneg {vector} {operands[0]}")
+        if op in ("max", "min"):
+            # One instruction; of a constant and NaN it gives NaN.
+            if type(args[1]) is not Value:
+                operands.reverse()
+            first = self.emit(f"fcmp {'ogt' if op == 'max' else 'olt'} {vector} {operands[0]}, {operands[1]}")
+            return self.emit(f"select {self.types['b']} {first}, {vector} {operands[0]}, {vector} {operands[1]}")
+        if op == "div":
+            return self.divide(*operands)
+        if op == "rsqrt":
+            return self.inverse_root(*operands)
+        if op == "sqrt" and self.estimates:
+            return self.root(*operands)
+        return self.intrinsic(_INTRINSICS[op], operands[0])
+
+    def sum_of_product(self, op: str, product: Value, args: tuple) -> str:
+        """A sum or difference with a product, rounded once."""
+        a, b = (self.operand(x, "f") for x in product.args)
+        first = args[0] is product
+        other = self.operand(args[1] if first else args[0], "f")
+        if op == "sub":
+            other, a = (self.negative(other), a) if first else (other, self.negative(a))
+        return self.multiply_add(a, b, other)
+
+    def intrinsic(self, name: str, *operands: str) -> str:
+        vector = self.types["f"]
+        full = f"@llvm.{name}.v{self.width}f{8 * self.dtype.itemsize}"
+        self.declare(f"declare {vector} {full}({', '.join([vector] * len(operands))})")
+        return self.emit(f"call {vector} {full}({', '.join(f'{vector} {x}' for x in operands)})")
+
+    def multiply_add(self, a: str, b: str, c: str) -> str:
+        return self.intrinsic("fma", a, b, c)
+
+    def negative(self, x: str) -> str:
+        return self.emit(f"fneg {self.types['f']} {x}")
+
+    def times(self, a: str, b: str) -> str:
+        return self.emit(f"fmul {self.types['f']} {a}, {b}")
+
+    def estimate(self, name: str, x: str) -> str:
+        """AVX-512's estimate of 1/x or 1/sqrt(x), good to 14 bits."""
+        vector, mask = self.types["f"], f"i{max(8, self.width)}"
+        full = f"@llvm.x86.avx512.{name}14.{'pd' if self.dtype.itemsize == 8 else 'ps'}.512"
+        self.declare(f"declare {vector} {full}({vector}, {vector}, {mask})")
+        return self.emit(f"call {vector} {full}({vector} {x}, {vector} zeroinitializer, {mask} -1)")
+
+    def sound(self, refined: str, estimate: str) -> str:
+        """The refined value; where that is NaN (x is zero, infinite or NaN), the estimate, which is exact there."""
+        lost = self.emit(f"fcmp uno {self.types['f']} {refined}, {refined}")
+        return self.emit(f"select {self.types['b']} {lost}, {self.types['f']} {estimate}, {self.types['f']} {refined}")
+
+    def divide(self, a: str, b: str) -> str:
+        vector = self.types["f"]
+        if not self.estimates:
+            return self.emit(f"fdiv {vector} {a}, {b}")
+        first = reciprocal = self.estimate("rcp", b)
+        minus = self.negative(b)
+        for _ in range(2 if self.dtype.itemsize == 8 else 1):
+            lacking = self.multiply_add(minus, reciprocal, self.constant(1, "f"))
+            reciprocal = self.multiply_add(reciprocal, lacking, reciprocal)
+        if a == self.constant(1, "f"):
+            return self.sound(reciprocal, first)
+        quotient = self.times(a, reciprocal)
+        lacking = self.multiply_add(minus, quotient, a)
+        quotient = self.multiply_add(lacking, reciprocal, quotient)
+        return self.sound(quotient, self.times(a, first))
+
+    def inverse_root(self, x: str) -> str:
+        vector = self.types["f"]
+        if not self.estimates:
+            return self.emit(f"fdiv {vector} {self.constant(1, 'f')}, {self.intrinsic('sqrt', x)}")
+        return self.sound(*self.refined_inverse_root(x))
+
+    def refined_inverse_root(self, x: str) -> tuple[str, str]:
+        first = inverse = self.estimate("rsqrt", x)
+        half = self.negative(self.times(x, self.constant(0.5, "f")))
+        for _ in range(2 if self.dtype.itemsize == 8 else 1):
+            lacking = self.multiply_add(half, self.times(inverse, inverse), self.constant(1.5, "f"))
+            inverse = self.times(inverse, lacking)
+        return inverse, first
+
+    def root(self, x: str) -> str:
+        """x / sqrt(x), and one step towards the root."""
+        inverse, _ = self.refined_inverse_root(x)
+        root = self.times(x, inverse)
+        lacking = self.multiply_add(self.negative(root), root, x)
+        root = self.multiply_add(lacking, self.times(inverse, self.constant(0.5, "f")), root)
+        vector, mask = self.types["f"], self.types["b"]
+        empty = self.emit(f"fcmp oeq {vector} {x}, zeroinitializer")
+        endless = self.emit(f"fcmp oeq {vector} {x}, {self.constant(np.inf, 'f')}")
+        itself = self.emit(f"or {mask} {empty}, {endless}")
+        return self.emit(f"select {mask} {itself}, {vector} {x}, {vector} {root}")
+
+    # Memory
+
+    def place(self, index: tuple, unit: str, base: str) -> str:
+        """Address of an entry: a known one, or so many strides further as a counter says."""
+        offset, counter, stride = index
+        place = str(offset)
+        if counter is not None:
+            moved = self.emit(f"mul i64 {self.registers.fetch(counter)}, {stride}")
+            place = self.emit(f"add i64 {moved}, {offset}")
+        return self.emit(f"getelementptr {unit}, ptr {base}, i64 {place}")
+
+    def load_own(self, kind: str, number: int, index: tuple) -> str:
+        return self.emit(f"load {self.types[kind]}, ptr {self.place(index, self.types[kind], self.own[number])}, align 64")
+
+    def load_shared(self, kind: str, number: int, index: tuple) -> str:
+        """The same number for all lanes."""
+        unit = {"f": self.scalar, "i": "i32", "b": "i8"}[kind]
+        one = self.emit(f"load {unit}, ptr {self.place(index, unit, self.shared[number])}")
+        if kind == "b":
+            one, unit = self.emit(f"icmp ne i8 {one}, 0"), "i1"
+        vector = self.types[kind]
+        lone = self.emit(f"insertelement {vector} poison, {unit} {one}, i64 0")
+        return self.emit(f"shufflevector {vector} {lone}, {vector} poison, <{self.width} x i32> zeroinitializer")
