@@ -11,22 +11,23 @@ FLOORS = {
     "arrays": 0,
     "compiling": 0,
     "fence": 0,
-    "geometry": 1,
-    "contact": 1,
-    "disturbance": 1,
-    "solvers": 1,
-    "robustness": 2,
-    "metrics": 3,
-    "hands": 3,
-    "candidates": 3,
-    "simulation": 4,
-    "synthesis": 5,
-    "ranking": 5,
-    "viewer": 6,
-    "cli": 7,
+    "kernels": 1,
+    "geometry": 2,
+    "contact": 2,
+    "disturbance": 2,
+    "solvers": 2,
+    "robustness": 3,
+    "metrics": 4,
+    "hands": 4,
+    "candidates": 4,
+    "simulation": 5,
+    "synthesis": 6,
+    "ranking": 6,
+    "viewer": 7,
+    "cli": 8,
 }
 # Packages that only some rooms may import.
-RESERVED = {"mujoco": {"hands", "simulation", "viewer"}, "optax": {"synthesis"}}
+RESERVED = {"mujoco": {"hands", "simulation", "viewer"}, "optax": {"synthesis"}, "llvmlite": {"kernels"}}
 
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

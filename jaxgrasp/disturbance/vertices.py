@@ -65,20 +65,20 @@ class Vertices:
 
 
 def _over_vertices(vertices: Tree, row: jax.Array, raise_to: Callable, best: Tree) -> Tree:
-    """Fold `raise_to(best, some vertices)` over vertices, leaves (directions, 6, *lanes), padded with the origin."""
+    """Fold `raise_to(best, some vertices)` over vertices, leaves (directions, 6, *lanes)."""
     first, *_ = jax.tree.leaves(vertices)
     count = first.shape[0]
     if count == 0:
         return best
     chunk = min(count, _chunk(row, first.shape[2:]))
-    chunks = -(-count // chunk)
-    extra = chunks * chunk - count
-    padded = jax.tree.map(lambda x: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)), vertices)
+    chunks, rest = divmod(count, chunk)
+    if rest:
+        best = fenced(raise_to)(best, jax.tree.map(lambda x: x[-rest:], vertices))
     if chunks == 1:
-        return fenced(raise_to)(best, padded)
+        return fenced(raise_to)(best, jax.tree.map(lambda x: x[:chunk], vertices))
 
     def body(i: jax.Array, best: Tree) -> Tree:
-        return raise_to(best, jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, i * chunk, chunk), padded))
+        return raise_to(best, jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, i * chunk, chunk), vertices))
 
     return lax.fori_loop(0, chunks, body, best)
 

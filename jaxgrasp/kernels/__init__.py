@@ -1,5 +1,5 @@
 """Fused kernels: one jaxpr, compiled to vector code with one problem per SIMD lane."""
 
-from jaxgrasp.kernels.fused import call, usable, without
+from jaxgrasp.kernels.native import fused, usable, without
 
-__all__ = ["call", "usable", "without"]
+__all__ = ["fused", "usable", "without"]

@@ -22,6 +22,7 @@ class Region:
     """
 
     def __init__(self, parent: "Region | None", guarded: bool = False) -> None:
+        """A region inside another one."""
         self.parent, self.guarded = parent, guarded
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.steps: list[Any] = []
@@ -38,6 +39,7 @@ class Value:
     count = 0
 
     def __init__(self, op: str, args: tuple, kind: str, region: Region) -> None:
+        """A new value."""
         self.op, self.args, self.kind, self.region = op, args, kind, region
         self.serial = Value.count = Value.count + 1
 
@@ -71,9 +73,15 @@ _FOLD: dict[str, Callable[..., Any]] = {
 }
 
 
+class Unsupported(Exception):
+    """Something that fused kernels cannot do."""
+
+
 def kind_of(dtype: Any) -> str:
     """The type of a scalar of this dtype."""
     kinds = {"f": "f", "i": "i", "b": "b", "u": "i"}
+    if np.dtype(dtype).kind not in kinds:
+        raise Unsupported(f"values of type {dtype}")
     return kinds[np.dtype(dtype).kind]
 
 
@@ -81,6 +89,7 @@ class Builder:
     """Makes values, in the region that is current."""
 
     def __init__(self, dtype: Any) -> None:
+        """For numbers of this type."""
         self.dtype = np.dtype(dtype)
         self.region = Region(None)
 
@@ -120,7 +129,9 @@ class Builder:
 
     def _home(self, args: tuple) -> Region:
         home, region = None, self.region
-        for x in args:
+        # Addresses in memory may depend on a counter.
+        index = args[1] if len(args) == 2 and isinstance(args[1], tuple) else ()
+        for x in (*args, *index):
             if type(x) is Value and (home is None or x.region.depth > home.depth):
                 home = x.region
         # The outermost region is the kernel's; guarded ones keep what is made in them.
@@ -164,8 +175,11 @@ class Builder:
                     return self.make("neg", b)
                 if not right and b.op == "neg":
                     return self.make("add", a, b.args[0])
-            elif right and b != 0 and np.isfinite(b) and b.dtype.kind == "f":
+            elif right and b != 0 and np.isfinite(b):
                 return self.make("mul", a, (1 / b).astype(b.dtype))
+            elif not (left and a == 1):
+                # The reciprocal may be had already, or before a loop.
+                return self.make("mul", a, self.make("div", self.dtype.type(1), b))
         elif op == "neg" and args[0].op == "neg":
             return args[0].args[0]
         elif op == "neg" and args[0].op == "sub":

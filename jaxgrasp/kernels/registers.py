@@ -20,6 +20,7 @@ class Registers:
     """
 
     def __init__(self, code: Any, schedule: Schedule, count: int) -> None:
+        """See the class."""
         self.code, self.schedule, self.count = code, schedule, count
         self.names: dict[Value, str] = {}
         self.places: dict[Value, str] = {}
@@ -30,7 +31,8 @@ class Registers:
         self.ahead: dict[Value, int] = {}
         self.ending: dict[int, list[Value]] = {}
         for value, last in schedule.last.items():
-            self.ending.setdefault(last, []).append(value)
+            if value.kind != "u":
+                self.ending.setdefault(last, []).append(value)
 
     def fetch(self, value: Value) -> str:
         """The name of a value, which is read from memory if need be."""

@@ -61,15 +61,17 @@ def scheduled(program: Program) -> Schedule:
 
 
 def operands(value: Value, fused: set[Value]) -> list[Value]:
-    """What has to be known to compute a value."""
+    """What has to be known to compute a value: its operands, and where those lie that are in memory."""
     if value.op in ("own", "shared"):
         return _values([value.args[1][1]])
     if value.op in ("carry", "result", "counter"):
         return []
-    needed = []
-    for x in _values(value.args):
-        needed += _values(x.args) if x in fused else [x]
-    return needed
+    return _addressed([y for x in _values(value.args) for y in (_values(x.args) if x in fused else (x,))])
+
+
+def _addressed(values: list[Value]) -> list[Value]:
+    """With what the addresses of those in memory depend on."""
+    return values + [y for x in values if x.op in ("own", "shared") for y in _values([x.args[1][1]])]
 
 
 def _values(entries: Iterable[Any]) -> list[Value]:
@@ -127,8 +129,7 @@ class _Order:
         """Steps, and what is asked for after them."""
         for step in region.steps:
             self.step(step, region)
-        for value in _values(results):
-            self.compute(value)
+        self.compute_all(results)
 
     def step(self, step: Step, region: Region) -> None:
         for value in self.outside(step, region):
@@ -147,7 +148,7 @@ class _Order:
         self.events.append(Event("leave", step, _values(step.outputs)))
 
     def compute_all(self, entries: Iterable[Any]) -> None:
-        for value in _values(entries):
+        for value in _addressed(_values(entries)):
             self.compute(value)
 
     def compute(self, root: Value) -> None:

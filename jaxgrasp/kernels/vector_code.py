@@ -1,7 +1,4 @@
-"""LLVM code of a program: one problem per lane of a vector register.
-
-The text is written here rather than with a library's objects, which would take longer than LLVM takes to compile it.
-"""
+"""LLVM code of a program: one problem per lane of a vector register."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxgrasp.kernels.expressions import Value
+from jaxgrasp.kernels.instructions import Instructions
 from jaxgrasp.kernels.lowering import Guard, Loop
 from jaxgrasp.kernels.registers import Registers
 from jaxgrasp.kernels.schedule import Schedule, in_memory
@@ -20,7 +18,7 @@ _INTEGER_CONDITIONS = {"eq": "eq", "ne": "ne", "lt": "slt", "le": "sle", "gt": "
 _INTRINSICS = {"sqrt": "sqrt", "exp": "exp", "log": "log", "floor": "floor", "abs": "fabs"}
 
 
-class VectorCode:
+class VectorCode(Instructions):
     """Writes instructions.
 
     Args:
@@ -30,16 +28,8 @@ class VectorCode:
     """
 
     def __init__(self, dtype: np.dtype, width: int, *, estimates: bool) -> None:
-        self.dtype, self.width, self.estimates = dtype, width, estimates
-        self.scalar = "double" if dtype.itemsize == 8 else "float"
-        self.types = {"f": f"<{width} x {self.scalar}>", "i": f"<{width} x i32>", "b": f"<{width} x i1>", "u": "i64"}
-        self.types["byte"] = f"<{width} x i8>"
-        self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
-        self.lines: list[str] = []
-        self.allocations: list[str] = []
-        self.declarations: set[str] = set()
-        self.block = "entry"
-        self.count = 0
+        """See the class."""
+        super().__init__(dtype, width, estimates=estimates)
         self.own: list[str] = []
         self.shared: list[str] = []
         self.fused: set[Value] = set()
@@ -50,68 +40,6 @@ class VectorCode:
         self.carried: dict[Value, tuple[Loop, int]] = {}
         self.homes: set[Value] = set()
 
-    # Instructions
-
-    def emit(self, text: str) -> str:
-        """An instruction with a result."""
-        self.count += 1
-        name = f"%v{self.count}"
-        self.lines.append(f"{name} = {text}")
-        return name
-
-    def do(self, text: str) -> None:
-        """An instruction without one."""
-        self.lines.append(text)
-
-    def label(self, purpose: str) -> str:
-        self.count += 1
-        return f"{purpose}{self.count}"
-
-    def enter(self, block: str) -> None:
-        self.lines.append(f"{block}:")
-        self.block = block
-
-    def allocate(self, kind: str, count: int = 1) -> str:
-        """Memory on the stack for vectors."""
-        self.count += 1
-        name = f"%m{self.count}"
-        stored = f"[{count} x {self.types[kind]}]"
-        self.allocations.append(f"{name} = alloca {stored}, align 64")
-        return name
-
-    def declare(self, text: str) -> None:
-        self.declarations.add(text)
-
-    def entry(self, base: str, unit: str, index: str | int) -> str:
-        """Address of an entry."""
-        return self.emit(f"getelementptr {unit}, ptr {base}, i64 {index}")
-
-    def repeat(self, count: int | str, body: Callable[[str], None]) -> None:
-        """`body(number)` so many times, at least once."""
-        before, inside, after = self.block, self.label("repeat"), self.label("after")
-        self.do(f"br label %{inside}")
-        self.enter(inside)
-        self.count += 1
-        number, place = f"%n{self.count}", len(self.lines)
-        self.do("")
-        body(number)
-        following = self.emit(f"add i64 {number}, 1")
-        self.lines[place] = f"{number} = phi i64 [ 0, %{before} ], [ {following}, %{self.block} ]"
-        again = self.emit(f"icmp ult i64 {following}, {count}")
-        self.do(f"br i1 {again}, label %{inside}, label %{after}")
-        self.enter(after)
-
-    def constant(self, value: Any, kind: str) -> str:
-        """A literal."""
-        if kind == "f":
-            return f"splat ({self.scalar} {self.float_literal(value)})" if self.width > 1 else self.float_literal(value)
-        if kind == "b":
-            return f"splat (i1 {'true' if value else 'false'})"
-        return str(int(value)) if kind == "u" else f"splat (i32 {int(value)})"
-
-    def float_literal(self, value: Any) -> str:
-        return f"0x{np.float64(self.dtype.type(value)).view(np.uint64):016X}"
-
     def operand(self, x: Any, kind: str) -> str:
         """The name or literal of a scalar."""
         if type(x) is not Value:
@@ -120,7 +48,9 @@ class VectorCode:
         if x.kind == "u" and kind != "u":
             short = self.emit(f"trunc i64 {name} to i32")
             one = self.emit(f"insertelement {self.types['i']} poison, i32 {short}, i64 0")
-            return self.emit(f"shufflevector {self.types['i']} {one}, {self.types['i']} poison, <{self.width} x i32> zeroinitializer")
+            return self.emit(
+                f"shufflevector {self.types['i']} {one}, {self.types['i']} poison, <{self.width} x i32> zeroinitializer"
+            )
         return name
 
     # Events
@@ -238,6 +168,7 @@ class VectorCode:
         return self.emit(f"load {self.types[kind]}, ptr {place}, align {self.alignment(kind)}")
 
     def alignment(self, kind: str) -> int:
+        """Of vectors in memory, in bytes."""
         return 1 if kind == "b" else self.width * (self.dtype.itemsize if kind == "f" else 4)
 
     def store_where(self, mask: str | None, new: str, slot: str, kind: str) -> None:
@@ -295,6 +226,7 @@ class VectorCode:
         return self.number(op, args, operands)
 
     def comparison(self, op: str, args: tuple) -> str:
+        """A mask."""
         kinds = {x.kind if type(x) is Value else None for x in args} - {None}
         kind = "f" if "f" in kinds else "b" if "b" in kinds else "i"
         left, right = (self.operand(x, kind) for x in args)
@@ -302,6 +234,7 @@ class VectorCode:
         return self.emit(f"{how} {self.types[kind]} {left}, {right}")
 
     def integer(self, op: str, vector: str, operands: list[str], kind: str) -> str:
+        """An operation on integers."""
         if op in ("max", "min"):
             truth = "i1" if kind == "u" else self.types["b"]
             first = self.emit(f"icmp {'sgt' if op == 'max' else 'slt'} {vector} {operands[0]}, {operands[1]}")
@@ -311,6 +244,7 @@ class VectorCode:
         return self.emit(f"{_INTEGERS[op]} {vector} {', '.join(operands)}")
 
     def number(self, op: str, args: tuple, operands: list[str]) -> str:
+        """An operation on numbers."""
         vector = self.types["f"]
         if op in _FLOATS:
             return self.emit(f"{_FLOATS[op]} {vector} {', '.join(operands)}")
@@ -323,7 +257,7 @@ class VectorCode:
             first = self.emit(f"fcmp {'ogt' if op == 'max' else 'olt'} {vector} {operands[0]}, {operands[1]}")
             return self.emit(f"select {self.types['b']} {first}, {vector} {operands[0]}, {vector} {operands[1]}")
         if op == "div":
-            return self.divide(*operands)
+            return self.reciprocal(operands[1])
         if op == "rsqrt":
             return self.inverse_root(*operands)
         if op == "sqrt" and self.estimates:
@@ -339,75 +273,6 @@ class VectorCode:
             other, a = (self.negative(other), a) if first else (other, self.negative(a))
         return self.multiply_add(a, b, other)
 
-    def intrinsic(self, name: str, *operands: str) -> str:
-        vector = self.types["f"]
-        full = f"@llvm.{name}.v{self.width}f{8 * self.dtype.itemsize}"
-        self.declare(f"declare {vector} {full}({', '.join([vector] * len(operands))})")
-        return self.emit(f"call {vector} {full}({', '.join(f'{vector} {x}' for x in operands)})")
-
-    def multiply_add(self, a: str, b: str, c: str) -> str:
-        return self.intrinsic("fma", a, b, c)
-
-    def negative(self, x: str) -> str:
-        return self.emit(f"fneg {self.types['f']} {x}")
-
-    def times(self, a: str, b: str) -> str:
-        return self.emit(f"fmul {self.types['f']} {a}, {b}")
-
-    def estimate(self, name: str, x: str) -> str:
-        """AVX-512's estimate of 1/x or 1/sqrt(x), good to 14 bits."""
-        vector, mask = self.types["f"], f"i{max(8, self.width)}"
-        full = f"@llvm.x86.avx512.{name}14.{'pd' if self.dtype.itemsize == 8 else 'ps'}.512"
-        self.declare(f"declare {vector} {full}({vector}, {vector}, {mask})")
-        return self.emit(f"call {vector} {full}({vector} {x}, {vector} zeroinitializer, {mask} -1)")
-
-    def sound(self, refined: str, estimate: str) -> str:
-        """The refined value; where that is NaN (x is zero, infinite or NaN), the estimate, which is exact there."""
-        lost = self.emit(f"fcmp uno {self.types['f']} {refined}, {refined}")
-        return self.emit(f"select {self.types['b']} {lost}, {self.types['f']} {estimate}, {self.types['f']} {refined}")
-
-    def divide(self, a: str, b: str) -> str:
-        vector = self.types["f"]
-        if not self.estimates:
-            return self.emit(f"fdiv {vector} {a}, {b}")
-        first = reciprocal = self.estimate("rcp", b)
-        minus = self.negative(b)
-        for _ in range(2 if self.dtype.itemsize == 8 else 1):
-            lacking = self.multiply_add(minus, reciprocal, self.constant(1, "f"))
-            reciprocal = self.multiply_add(reciprocal, lacking, reciprocal)
-        if a == self.constant(1, "f"):
-            return self.sound(reciprocal, first)
-        quotient = self.times(a, reciprocal)
-        lacking = self.multiply_add(minus, quotient, a)
-        quotient = self.multiply_add(lacking, reciprocal, quotient)
-        return self.sound(quotient, self.times(a, first))
-
-    def inverse_root(self, x: str) -> str:
-        vector = self.types["f"]
-        if not self.estimates:
-            return self.emit(f"fdiv {vector} {self.constant(1, 'f')}, {self.intrinsic('sqrt', x)}")
-        return self.sound(*self.refined_inverse_root(x))
-
-    def refined_inverse_root(self, x: str) -> tuple[str, str]:
-        first = inverse = self.estimate("rsqrt", x)
-        half = self.negative(self.times(x, self.constant(0.5, "f")))
-        for _ in range(2 if self.dtype.itemsize == 8 else 1):
-            lacking = self.multiply_add(half, self.times(inverse, inverse), self.constant(1.5, "f"))
-            inverse = self.times(inverse, lacking)
-        return inverse, first
-
-    def root(self, x: str) -> str:
-        """x / sqrt(x), and one step towards the root."""
-        inverse, _ = self.refined_inverse_root(x)
-        root = self.times(x, inverse)
-        lacking = self.multiply_add(self.negative(root), root, x)
-        root = self.multiply_add(lacking, self.times(inverse, self.constant(0.5, "f")), root)
-        vector, mask = self.types["f"], self.types["b"]
-        empty = self.emit(f"fcmp oeq {vector} {x}, zeroinitializer")
-        endless = self.emit(f"fcmp oeq {vector} {x}, {self.constant(np.inf, 'f')}")
-        itself = self.emit(f"or {mask} {empty}, {endless}")
-        return self.emit(f"select {mask} {itself}, {vector} {x}, {vector} {root}")
-
     # Memory
 
     def place(self, index: tuple, unit: str, base: str) -> str:
@@ -420,7 +285,10 @@ class VectorCode:
         return self.emit(f"getelementptr {unit}, ptr {base}, i64 {place}")
 
     def load_own(self, kind: str, number: int, index: tuple) -> str:
-        return self.emit(f"load {self.types[kind]}, ptr {self.place(index, self.types[kind], self.own[number])}, align 64")
+        """A different number for every lane."""
+        return self.emit(
+            f"load {self.types[kind]}, ptr {self.place(index, self.types[kind], self.own[number])}, align 64"
+        )
 
     def load_shared(self, kind: str, number: int, index: tuple) -> str:
         """The same number for all lanes."""

@@ -1,7 +1,8 @@
 """Batches as lanes: any leading axes and any nesting of vmap become one trailing axis, worked through in tiles.
 
 A kernel is a function of arrays whose last axis is the lane; a leaf that all lanes share has a last axis of size 1. On
-CPUs the lanes are cut into tiles that stay in the cache; elsewhere they go at once.
+CPUs it becomes native code where it can, see `kernels`; else XLA cuts the lanes into tiles that stay in the cache.
+Elsewhere they go at once.
 """
 
 import math
@@ -15,8 +16,8 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from jaxgrasp import kernels
 from jaxgrasp.fence import fences
+from jaxgrasp.kernels import fused
 
 Tree = Any
 # Values of all rows of a tile: its working set has to fit in the second-level cache, and XLA's CPU backend would cut
@@ -132,8 +133,8 @@ def tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
-        fused = kernels.call(partial(_in_turn, (first, *stages[1:])), leaves, shared)
-        return in_compact_tiles() if fused is None else fused
+        out = fused(partial(_in_turn, (first, *stages[1:])), leaves, shared)
+        return in_compact_tiles() if out is None else out
 
     def in_compact_tiles() -> Tree:
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)

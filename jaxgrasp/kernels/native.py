@@ -1,6 +1,6 @@
 """Fused kernels: a batch function as one call of native code, where that can be had.
 
-`call` takes a function of one problem. Its jaxpr is lowered to vector code, one problem per lane, and called through
+`fused` takes a function of one problem. Its jaxpr is lowered to vector code, one problem per lane, and called through
 XLA's foreign function interface; kernels are kept in the process and on disk. Where anything is missing, XLA runs the
 same function instead, with one warning that says why.
 """
@@ -14,6 +14,7 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,15 +24,14 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxgrasp.fence import loops
 from jaxgrasp.kernels import cpu, machine
-from jaxgrasp.kernels.lowering import Unsupported, lowered
+from jaxgrasp.kernels.expressions import Unsupported
+from jaxgrasp.kernels.lowering import lowered
 from jaxgrasp.kernels.machine import Unavailable
 
 Tree = Any
 SETTING = "JAXGRASP_KERNELS"
 _allowed = contextvars.ContextVar("allowed", default=True)
 _lock = threading.RLock()
-# Raise with every change of what kernels compute for the same jaxpr.
-_VERSION = 1
 
 
 @contextlib.contextmanager
@@ -44,7 +44,9 @@ def without() -> Iterator[None]:
         _allowed.reset(token)
 
 
-def call(function: Callable[[list[jax.Array]], Tree], leaves: list[jax.Array], shared: tuple[bool, ...]) -> Tree | None:
+def fused(
+    function: Callable[[list[jax.Array]], Tree], leaves: list[jax.Array], shared: tuple[bool, ...]
+) -> Tree | None:
     """Run a function over the leading axis of its arguments, or None where only XLA can.
 
     Args:
@@ -91,8 +93,10 @@ def _works() -> bool:
             out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(jnp.asarray(start))
         if not np.array_equal(np.asarray(out), start + 1):
             raise Unavailable("this version of XLA hands arrays over in another way")
-    except (Unavailable, Unsupported) as error:
+    except Unavailable as error:
         _tell(str(error))
+    except Unsupported:
+        pass  # It does not compile, which was told.
     except (RuntimeError, OSError) as error:
         _tell(f"the smallest one fails: {error}")
     else:
@@ -152,25 +156,30 @@ def _registered(key: str, jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
         try:
             machine.keep(key, objects)
         except OSError as error:
-            _tell_once_about_disk(error)
+            _tell_of_disk(str(error))
     jax.ffi.register_ffi_target(name, machine.capsule(machine.loaded(objects, name)), platform="cpu")
     return name
 
 
 @functools.cache
-def _disk() -> list[str]:
-    return []
+def _tell_of_disk(why: str) -> None:
+    warnings.warn(
+        f"jaxgrasp's kernels cannot be kept on disk, so every process compiles its own: {why}",
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 
-def _tell_once_about_disk(error: OSError) -> None:
-    if not _disk():
-        _disk().append(str(error))
-        warnings.warn(f"jaxgrasp's kernels cannot be kept on disk, so every process compiles its own: {error}", RuntimeWarning, stacklevel=2)
+@functools.cache
+def _source() -> str:
+    """Changes whenever this room does, and with it what is compiled."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def _fingerprint(jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
     """The same for programs that are the same, in any process on any machine of this kind."""
-    digest = hashlib.sha256(f"{_VERSION} {machine.machine().description} {shared}".encode())
+    digest = hashlib.sha256(f"{_source()} {machine.machine().description} {shared}".encode())
     numbers: dict[Any, int] = {}
 
     def name(v: Any) -> str:
@@ -211,4 +220,12 @@ def _fingerprint(jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
 
 
 _INCIDENTAL = {"name", "jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "ctx_mesh", "donated_invars"}
-_INCIDENTAL |= {"compiler_options_kvs", "in_shardings", "out_shardings", "in_layouts", "out_layouts", "sharding", "out_sharding"}
+_INCIDENTAL |= {
+    "compiler_options_kvs",
+    "in_shardings",
+    "out_shardings",
+    "in_layouts",
+    "out_layouts",
+    "sharding",
+    "out_sharding",
+}

@@ -1,0 +1,166 @@
+"""Instructions on vectors, as text of LLVM's language.
+
+The text is written here rather than with a library's objects, which would take longer than LLVM takes to compile it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+
+class Instructions:
+    """Writes instructions.
+
+    Args:
+        dtype: of numbers.
+        width: lanes of a vector.
+        estimates: whether the processor has AVX-512's estimates of reciprocals.
+    """
+
+    def __init__(self, dtype: np.dtype, width: int, *, estimates: bool) -> None:
+        """See the class."""
+        self.dtype, self.width, self.estimates = dtype, width, estimates
+        self.scalar = "double" if dtype.itemsize == 8 else "float"
+        self.types = {"f": f"<{width} x {self.scalar}>", "i": f"<{width} x i32>", "b": f"<{width} x i1>", "u": "i64"}
+        self.types["byte"] = f"<{width} x i8>"
+        self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
+        self.lines: list[str] = []
+        self.allocations: list[str] = []
+        self.declarations: set[str] = set()
+        self.block = "entry"
+        self.count = 0
+
+    def emit(self, text: str) -> str:
+        """An instruction with a result."""
+        self.count += 1
+        name = f"%v{self.count}"
+        self.lines.append(f"{name} = {text}")
+        return name
+
+    def do(self, text: str) -> None:
+        """An instruction without one."""
+        self.lines.append(text)
+
+    def label(self, purpose: str) -> str:
+        """A new name for a block."""
+        self.count += 1
+        return f"{purpose}{self.count}"
+
+    def enter(self, block: str) -> None:
+        """Begin a block."""
+        self.lines.append(f"{block}:")
+        self.block = block
+
+    def allocate(self, kind: str, count: int = 1) -> str:
+        """Memory on the stack for vectors."""
+        self.count += 1
+        name = f"%m{self.count}"
+        stored = f"[{count} x {self.types[kind]}]"
+        self.allocations.append(f"{name} = alloca {stored}, align 64")
+        return name
+
+    def declare(self, text: str) -> None:
+        """A function of LLVM's that is called."""
+        self.declarations.add(text)
+
+    def entry(self, base: str, unit: str, index: str | int) -> str:
+        """Address of an entry."""
+        return self.emit(f"getelementptr {unit}, ptr {base}, i64 {index}")
+
+    def repeat(self, count: int | str, body: Callable[[str], None]) -> None:
+        """`body(number)` so many times, at least once."""
+        before, inside, after = self.block, self.label("repeat"), self.label("after")
+        self.do(f"br label %{inside}")
+        self.enter(inside)
+        self.count += 1
+        number, place = f"%n{self.count}", len(self.lines)
+        self.do("")
+        body(number)
+        following = self.emit(f"add i64 {number}, 1")
+        self.lines[place] = f"{number} = phi i64 [ 0, %{before} ], [ {following}, %{self.block} ]"
+        again = self.emit(f"icmp ult i64 {following}, {count}")
+        self.do(f"br i1 {again}, label %{inside}, label %{after}")
+        self.enter(after)
+
+    def constant(self, value: Any, kind: str) -> str:
+        """A literal."""
+        if kind == "f":
+            return f"splat ({self.scalar} {self.float_literal(value)})" if self.width > 1 else self.float_literal(value)
+        if kind == "b":
+            return f"splat (i1 {'true' if value else 'false'})"
+        return str(int(value)) if kind == "u" else f"splat (i32 {int(value)})"
+
+    def float_literal(self, value: Any) -> str:
+        """As LLVM reads it without rounding."""
+        return f"0x{np.float64(self.dtype.type(value)).view(np.uint64):016X}"
+
+    def intrinsic(self, name: str, *operands: str) -> str:
+        """A call of one of LLVM's own functions of vectors."""
+        vector = self.types["f"]
+        full = f"@llvm.{name}.v{self.width}f{8 * self.dtype.itemsize}"
+        self.declare(f"declare {vector} {full}({', '.join([vector] * len(operands))})")
+        return self.emit(f"call {vector} {full}({', '.join(f'{vector} {x}' for x in operands)})")
+
+    def multiply_add(self, a: str, b: str, c: str) -> str:
+        """The sum a b + c, rounded once."""
+        return self.intrinsic("fma", a, b, c)
+
+    def negative(self, x: str) -> str:
+        """The value -x."""
+        return self.emit(f"fneg {self.types['f']} {x}")
+
+    def times(self, a: str, b: str) -> str:
+        """The product a b."""
+        return self.emit(f"fmul {self.types['f']} {a}, {b}")
+
+    def estimate(self, name: str, x: str) -> str:
+        """AVX-512's estimate of 1/x or 1/sqrt(x), good to 14 bits."""
+        vector, mask = self.types["f"], f"i{max(8, self.width)}"
+        full = f"@llvm.x86.avx512.{name}14.{'pd' if self.dtype.itemsize == 8 else 'ps'}.512"
+        self.declare(f"declare {vector} {full}({vector}, {vector}, {mask})")
+        return self.emit(f"call {vector} {full}({vector} {x}, {vector} zeroinitializer, {mask} -1)")
+
+    def sound(self, refined: str, estimate: str) -> str:
+        """The refined value; where that is NaN (x is zero, infinite or NaN), the estimate, which is exact there."""
+        lost = self.emit(f"fcmp uno {self.types['f']} {refined}, {refined}")
+        return self.emit(f"select {self.types['b']} {lost}, {self.types['f']} {estimate}, {self.types['f']} {refined}")
+
+    def reciprocal(self, x: str) -> str:
+        """The reciprocal 1 / x."""
+        one = self.constant(1, "f")
+        if not self.estimates:
+            return self.emit(f"fdiv {self.types['f']} {one}, {x}")
+        first = inverse = self.estimate("rcp", x)
+        minus = self.negative(x)
+        for _ in range(2 if self.dtype.itemsize == 8 else 1):
+            lacking = self.multiply_add(minus, inverse, one)
+            inverse = self.multiply_add(inverse, lacking, inverse)
+        return self.sound(inverse, first)
+
+    def inverse_root(self, x: str) -> str:
+        """1 / sqrt(x)."""
+        if not self.estimates:
+            return self.reciprocal(self.intrinsic("sqrt", x))
+        return self.sound(*self.refined_inverse_root(x))
+
+    def refined_inverse_root(self, x: str) -> tuple[str, str]:
+        """1 / sqrt(x), NaN where x is zero or infinite, and the estimate of it."""
+        first = inverse = self.estimate("rsqrt", x)
+        for _ in range(2 if self.dtype.itemsize == 8 else 1):
+            # In this order nothing is too small for an ordinary number.
+            lacking = self.multiply_add(self.negative(self.times(x, inverse)), inverse, self.constant(1, "f"))
+            inverse = self.multiply_add(self.times(inverse, self.constant(0.5, "f")), lacking, inverse)
+        return inverse, first
+
+    def root(self, x: str) -> str:
+        """The root: x / sqrt(x), and one step towards the root."""
+        inverse, _ = self.refined_inverse_root(x)
+        root = self.times(x, inverse)
+        lacking = self.multiply_add(self.negative(root), root, x)
+        root = self.multiply_add(lacking, self.times(inverse, self.constant(0.5, "f")), root)
+        vector, mask = self.types["f"], self.types["b"]
+        empty = self.emit(f"fcmp oeq {vector} {x}, zeroinitializer")
+        endless = self.emit(f"fcmp oeq {vector} {x}, {self.constant(np.inf, 'f')}")
+        itself = self.emit(f"or {mask} {empty}, {endless}")
+        return self.emit(f"select {mask} {itself}, {vector} {x}, {vector} {root}")
