@@ -30,9 +30,12 @@ ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 
 def fused(function, *leaves, shared=None):
     """A function of one problem over the leading axis, fused; the lane axis trails inside."""
-    out = native.fused(lambda parts: function(*parts), list(leaves), shared or (False,) * len(leaves))
-    assert out is not None, "no fused kernel"
-    return out
+    run = partial(native.fused, shared=shared or (False,) * len(leaves), otherwise=no_kernel)
+    return run(lambda parts: function(*parts), list(leaves))
+
+
+def no_kernel(leaves):
+    raise AssertionError("no fused kernel")
 
 
 def mapped(function, *leaves, shared=None):
@@ -146,8 +149,11 @@ def test_long_loops_read_what_all_problems_share():
 
 
 def test_what_cannot_be_fused_is_left_to_xla():
-    assert native.fused(lambda parts: jnp.fft.fft(parts[0][:, 0]).real[:, None], [rows(3, 4)], (False,)) is None
-    assert native.fused(lambda parts: parts[0][0].astype(jnp.int64), [rows(3, 4)], (False,)) is None
+    def transform(parts):
+        return jnp.fft.fft(parts[0][:, 0]).real[:, None]
+
+    left = native.fused(transform, [rows(3, 4)], (False,), lambda leaves: leaves[0] * 2)
+    np.testing.assert_array_equal(left, rows(3, 4) * 2)
 
 
 def without_kernels(function, *args):
@@ -225,9 +231,9 @@ def run(code: str, **environment: str) -> subprocess.CompletedProcess:
 SMALL = """
 import jax, numpy as np, jax.numpy as jnp
 from jaxgrasp.kernels import native
-out = native.fused(lambda parts: parts[0] * 2, [jnp.ones((3, 2))], (False,))
-again = native.fused(lambda parts: parts[0] * 3, [jnp.ones((3, 2))], (False,))
-print(None if out is None else float(out.sum()))
+out = native.fused(lambda parts: parts[0] * 2, [jnp.ones((3, 2))], (False,), lambda leaves: jnp.zeros(1))
+again = native.fused(lambda parts: parts[0] * 3, [jnp.ones((3, 2))], (False,), lambda leaves: jnp.zeros(1))
+print(float(out.sum()))
 """
 
 
@@ -250,14 +256,14 @@ print(None if out is None else float(out.sum()))
 )
 def test_where_there_are_none_one_warning_says_why(before, why, tmp_path):
     done = run(before + SMALL, XDG_CACHE_HOME=str(tmp_path))
-    assert done.stdout.strip() == "None"
+    assert done.stdout.strip() == "0.0"
     assert done.stderr.count("fused kernels are not used") == 1
     assert why in done.stderr
 
 
 def test_the_setting(monkeypatch, tmp_path):
     done = run(SMALL, JAXGRASP_KERNELS="xla")
-    assert done.stdout.strip() == "None" and "fused" not in done.stderr
+    assert done.stdout.strip() == "0.0" and "fused" not in done.stderr
     monkeypatch.setenv("JAXGRASP_KERNELS", "fast")
     with pytest.raises(ValueError, match="JAXGRASP_KERNELS: got 'fast', wanted auto or xla"):
         kernels.usable()

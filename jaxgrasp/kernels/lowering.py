@@ -132,7 +132,8 @@ class _Lowering:
         rule = RULES.get(name)
         if rule is None:
             raise Unsupported(f"the operation {name}")
-        return [np.asarray(rule(self, params, aval, *args))]
+        out = rule(self, params, aval, *args)
+        return out if isinstance(out, list) else [np.asarray(out)]
 
     def elementwise(self, op: str, args: list[np.ndarray], aval: Any) -> np.ndarray:
         """An operation entry by entry."""
@@ -266,6 +267,13 @@ class _Lowering:
             results = out if results is None else self.choose(taken, out, results)
         return results
 
+    def linear_solve(self, params: dict, args: list[np.ndarray]) -> list[np.ndarray]:
+        """What solves the system, among what JAX is told about it."""
+        lengths, solve = params["const_lengths"], params["jaxprs"].solve
+        before = lengths.matvec + lengths.vecmat
+        consts, right = args[before : before + lengths.solve], args[sum(lengths) :]
+        return self.run(solve.jaxpr, [np.asarray(c) for c in solve.consts], [*consts, *right])
+
     def choose(self, taken: Any, new: list[np.ndarray], old: list[np.ndarray]) -> list[np.ndarray]:
         """The new arrays where taken, else the old ones."""
         make = self.builder.make
@@ -333,4 +341,4 @@ _CALLS = {
     "remat": "jaxpr",
 }
 _CALLS |= {"custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr", "core_call": "call_jaxpr"}
-_CONTROL = {"scan": "scan", "while": "while_loop", "cond": "cond"}
+_CONTROL = {"scan": "scan", "while": "while_loop", "cond": "cond", "custom_linear_solve": "linear_solve"}

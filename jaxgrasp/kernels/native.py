@@ -20,7 +20,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
+from jax.interpreters import mlir
 
 from jaxgrasp.fence import loops
 from jaxgrasp.kernels import cpu, machine
@@ -45,29 +46,50 @@ def without() -> Iterator[None]:
 
 
 def fused(
-    function: Callable[[list[jax.Array]], Tree], leaves: list[jax.Array], shared: tuple[bool, ...]
-) -> Tree | None:
-    """Run a function over the leading axis of its arguments, or None where only XLA can.
+    function: Callable[[list[jax.Array]], Tree],
+    leaves: list[jax.Array],
+    shared: tuple[bool, ...],
+    otherwise: Callable[[list[jax.Array]], Tree],
+) -> Tree:
+    """Run a function over the leading axis of its arguments.
 
     Args:
         function: of a list of arrays with one trailing axis of size 1; returns a tree of such arrays.
         leaves: (problems, ...), or without the leading axis where shared.
         shared: for every leaf.
+        otherwise: the same function of `leaves`, for XLA, where there is no fused kernel.
     """
     if not _allowed.get() or not usable():
-        return None
+        return otherwise(leaves)
     problems = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
     events = [x.shape if s else x.shape[1:] for x, s in zip(leaves, shared, strict=True)]
     given = [jax.ShapeDtypeStruct((*e, 1), x.dtype) for e, x in zip(events, leaves, strict=True)]
     with loops():
         jaxpr, out = jax.make_jaxpr(function, return_shape=True)(given)
-    try:
-        name = _target(jaxpr, shared)
-    except Unsupported:
-        return None
     wanted, structure = jax.tree.flatten(out)
-    shapes = [jax.ShapeDtypeStruct((problems, *x.shape[:-1]), x.dtype) for x in wanted]
-    return jax.tree.unflatten(structure, jax.ffi.ffi_call(name, shapes)(*leaves))
+    shapes = tuple(jax.core.ShapedArray((problems, *x.shape[:-1]), x.dtype) for x in wanted)
+    flat = lambda *leaves: jax.tree.leaves(otherwise(list(leaves)))  # noqa: E731
+    return jax.tree.unflatten(
+        structure, _fused_p.bind(*leaves, jaxpr=jaxpr, shared=shared, shapes=shapes, otherwise=flat)
+    )
+
+
+# A primitive, so that kernels whose results nobody uses are never compiled.
+_fused_p = Primitive("fused")
+_fused_p.multiple_results = True
+_fused_p.def_impl(lambda *leaves, **params: jax.jit(functools.partial(_fused_p.bind, **params))(*leaves))
+_fused_p.def_abstract_eval(lambda *_, shapes, **__: list(shapes))
+
+
+def _lower(ctx: Any, *leaves: Any, jaxpr: ClosedJaxpr, shared: Any, shapes: Any, otherwise: Any) -> Any:
+    try:
+        name = target(jaxpr, shared)
+    except Unsupported:
+        return mlir.lower_fun(otherwise, multiple_results=True)(ctx, *leaves)
+    return jax.ffi.ffi_lowering(name)(ctx, *leaves)
+
+
+mlir.register_lowering(_fused_p, _lower)
 
 
 def usable() -> bool:
@@ -88,7 +110,7 @@ def _works() -> bool:
         start = np.arange(3, dtype=np.float32)
         with _lock:
             jaxpr = jax.make_jaxpr(lambda x: x + 1)(jax.ShapeDtypeStruct((1,), np.float32))
-            name = _target(jaxpr, (False,))
+            name = target(jaxpr, (False,))
         with jax.ensure_compile_time_eval():
             out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(jnp.asarray(start))
         if not np.array_equal(np.asarray(out), start + 1):
@@ -117,7 +139,7 @@ def _tell(why: str) -> None:
 _known: dict[str, str | None] = {}
 
 
-def _target(jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
+def target(jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
     """The name under which XLA knows a kernel; compiled, or read from disk, where it is new.
 
     Raises:

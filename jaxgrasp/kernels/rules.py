@@ -1,6 +1,6 @@
 """What the operations of a jaxpr mean for arrays of scalars.
 
-Each rule takes the lowering, the operation's parameters, the shape and type of the result, and the operands.
+Each rule takes the lowering, the operation's parameters, the shape and type of the (first) result, and the operands.
 """
 
 import math
@@ -86,6 +86,19 @@ def _power(lower: Any, params: dict, aval: Any, x: np.ndarray) -> np.ndarray:
     return one if out is None else out if y > 0 else lower.elementwise("div", [one, out], aval)
 
 
+def _real_power(lower: Any, params: dict, aval: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Powers that are roots or whole numbers."""
+    exponents = {float(v) for v in objects(y).ravel() if type(v) is not Value}
+    if y.dtype == object and any(type(v) is Value for v in y.flat) or len(exponents) != 1:
+        raise Unsupported("a power that is computed")
+    (exponent,) = exponents
+    if exponent.is_integer():
+        return _power(lower, {"y": int(exponent)}, aval, x)
+    if exponent in (0.5, -0.5):
+        return lower.elementwise("sqrt" if exponent > 0 else "rsqrt", [x], aval)
+    raise Unsupported(f"the power {exponent}")
+
+
 def _square(lower: Any, params: dict, aval: Any, x: np.ndarray) -> np.ndarray:
     return lower.elementwise("mul", [x, x], aval)
 
@@ -123,6 +136,14 @@ def _slice(lower: Any, params: dict, aval: Any, x: np.ndarray) -> np.ndarray:
     strides = params["strides"] or (1,) * x.ndim
     parts = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return x[tuple(slice(*p) for p in parts)]
+
+
+def _split(lower: Any, params: dict, aval: Any, x: np.ndarray) -> list[np.ndarray]:
+    return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
+
+
+def _unstack(lower: Any, params: dict, aval: Any, x: np.ndarray) -> list[np.ndarray]:
+    return list(np.moveaxis(x, params["axis"], 0))
 
 
 def _concatenate(lower: Any, params: dict, aval: Any, *parts: np.ndarray) -> np.ndarray:
@@ -293,6 +314,7 @@ RULES: dict[str, Callable] = {
     "argmin": _arg("lt"),
     "convert_element_type": _convert,
     "integer_pow": _power,
+    "pow": _real_power,
     "square": _square,
     "sign": _sign,
     "clamp": _clamp,
@@ -309,6 +331,8 @@ RULES: dict[str, Callable] = {
     "transpose": lambda lower, params, aval, x: x.transpose(params["permutation"]),
     "rev": lambda lower, params, aval, x: np.flip(x, params["dimensions"]),
     "slice": _slice,
+    "split": _split,
+    "unstack": _unstack,
     "concatenate": _concatenate,
     "stack": _stack,
     "pad": _pad,

@@ -65,6 +65,8 @@ class Grasps:
     """(*lanes), the margin that is asked for."""
     smoothing: jax.Array | None
     """(*lanes), kappa of the central point that is asked for."""
+    cutoff: jax.Array | None
+    """(*lanes), what the margin must reach to be of interest."""
     actuated: Actuated | None
     """What the hand's actuators can do; None where the fingers can push at will."""
 
@@ -84,6 +86,7 @@ def over_grasps(
     effort_weights: Any = None,
     margin: Any = None,
     smoothing: Any = None,
+    cutoff: Any = None,
     actuation: Any = None,
 ) -> Any:
     """Check shapes, run a kernel over all grasps of a batch and give its results the batch's shape.
@@ -105,6 +108,7 @@ def over_grasps(
         "effort_weights": effort_weights,
         "margin": margin,
         "smoothing": smoothing,
+        "cutoff": cutoff,
     }
     for name, value in given.items():
         if value is not None and not isinstance(value, Compliance):
@@ -132,7 +136,7 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
         other["compliance"] = _compliance(compliance, n)
     if effort_weights is not None:
         other["weights"] = _argument("effort_weights", effort_weights, (n, 3, 3))
-    for name in ("margin", "smoothing"):
+    for name in ("margin", "smoothing", "cutoff"):
         if given[name] is not None:
             other[name] = _argument(name, given[name], ())
     if given["actuation"] is not None:
@@ -289,6 +293,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
         weight_roots=weight_roots,
         margin=margin,
         smoothing=smoothing,
+        cutoff=raw.get("cutoff"),
         actuated=_actuated(raw, there, valid, length, friction, max_force) if "jacobian" in raw else None,
     )
 

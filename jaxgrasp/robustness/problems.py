@@ -16,10 +16,11 @@ from jaxgrasp.solvers.margin_problem import MarginProblem
 _REFINEMENTS = {"float64": 0, "float32": 1}
 
 
-def margin_problem(program: Program) -> MarginProblem:
-    """(21)."""
+def margin_problem(program: Program, cutoff: jax.Array | None = None) -> MarginProblem:
+    """(21); a margin below the cutoff, in units of the disturbances, is of no interest."""
     refinements = _REFINEMENTS[program.rhs.dtype.name]
-    return MarginProblem(program.groups, program.rhs, program.dropped, program.radius, refinements)
+    cutoff = None if cutoff is None else cutoff / program.scale
+    return MarginProblem(program.groups, program.rhs, program.dropped, program.radius, refinements, cutoff)
 
 
 class Effort(NamedTuple):

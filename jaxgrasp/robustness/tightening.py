@@ -54,6 +54,7 @@ def largest_disturbance(
     cone_margin: ArrayLike = 0.0,
     smoothing: ArrayLike | None = None,
     actuation: Actuation | None = None,
+    cutoff: ArrayLike | None = None,
 ) -> Solution:
     """The robustness margin (21): the largest factor by which the disturbances may be scaled while the grasp holds.
 
@@ -76,6 +77,8 @@ def largest_disturbance(
         actuation: what the hand can do: efforts u with J'f_0 = B u that stay within their limits while the worst
             disturbance acts join the unknowns, and G* leaves joint directions that no actuator reaches without torque.
             None lets every finger push at will.
+        cutoff: (*batch,), in units of the margin: grasps are given up as soon as a certified upper bound is below, with
+            the bounds found so far. None (or NaN) gives up none.
 
     Returns:
         Solution with `*batch` axes. `margin` is attained by `forces`, and no forces reach more than `upper_bound`.
@@ -85,8 +88,9 @@ def largest_disturbance(
 
     Status:
         SOLVED; INFEASIBLE (b cannot be borne); UNBOUNDED (nothing disturbs, margin inf); INVALID_INPUT (data not
-        admissible, for that grasp alone); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot tell). With smoothing, SOLVED
-        means that the central point was found; its margin may be negative, which then proves nothing.
+        admissible, for that grasp alone); PRUNED (below the cutoff); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot
+        tell). With smoothing, SOLVED means that the central point was found; its margin may be negative, which then
+        proves nothing.
 
     Derivatives:
         Of margin (and upper_bound), forces, effort and multipliers with respect to everything that is continuous, of
@@ -103,6 +107,7 @@ def largest_disturbance(
         compliance=compliance,
         cone_margin=cone_margin,
         smoothing=smoothing,
+        cutoff=cutoff,
         actuation=actuation,
     )
 
@@ -199,7 +204,7 @@ class _LargestDisturbance(_Tightening):
         return _solve_margin(grasps, program)[0]
 
     def tangents(self, along: Along, out: Solution) -> Solution:
-        point = self._point(out, jnp.isfinite(out.margin))
+        point = self._point(out, jnp.isfinite(out.margin) & (out.status != Status.PRUNED))
         change = self._central(along, point)
         if not self.smooth:
             adjoint = partial(envelope_adjoint, self.cone_edges)
@@ -224,7 +229,7 @@ def _changed(out: Solution, change: Point, upper_bound: jax.Array | None) -> Sol
 def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     """(21) for lanes; also the scaled record, from which (22) starts."""
     dtype = program.rhs.dtype
-    problem = margin_problem(program)
+    problem = margin_problem(program, grasps.cutoff)
     settings = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     # Without a load, no forces at all are an answer with margin 0, exactly.
@@ -237,13 +242,14 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     size = jnp.maximum(1, jnp.abs(low))
     closed = high - low <= _ACCEPTED_GAP[dtype.name] * jnp.where(jnp.isinf(low), 1, size)
     bearable = low >= -settings.tolerance
+    pruned = jnp.zeros_like(bearable) if problem.cutoff is None else high < problem.cutoff
 
     margin, upper = low * program.scale, high * program.scale
     margin = jnp.where(program.slippery, jnp.minimum(margin, 0), margin)
     upper = jnp.where(program.slippery, jnp.minimum(upper, 0), upper)
     hopeless = high < -settings.tolerance
     upper = jnp.where(hopeless & jnp.isinf(low), 0, upper)
-    margin = jnp.where(hopeless & ~closed, jnp.nan, margin)
+    margin = jnp.where(hopeless & ~closed | pruned & jnp.isinf(low), jnp.nan, margin)
     decided = [
         (~grasps.valid, Status.INVALID_INPUT, jnp.nan),
         (program.wrench_outside, Status.INFEASIBLE, jnp.nan),
@@ -252,8 +258,8 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
         ((program.disturbance_outside | program.undisturbed) & hopeless, Status.INFEASIBLE, jnp.nan),
     ]
     status = jnp.select(
-        [c for c, _, _ in decided] + [hopeless, bearable & closed, program.doubtful],
-        [s for _, s, _ in decided] + [Status.INFEASIBLE, Status.SOLVED, Status.ILL_CONDITIONED],
+        [c for c, _, _ in decided] + [hopeless, bearable & closed, pruned, program.doubtful],
+        [s for _, s, _ in decided] + [Status.INFEASIBLE, Status.SOLVED, Status.PRUNED, Status.ILL_CONDITIONED],
         Status.MAX_ITERATIONS,
     ).astype(jnp.int32)
     margin = jnp.select([c for c, _, _ in decided], [jnp.full_like(low, m) for *_, m in decided], margin)

@@ -102,7 +102,6 @@ def tiled(
 ) -> Tree:
     """`map_lanes` of leaves, without a rule for `jax.vmap`; rows are 0 where tiles cannot be compact."""
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
-
     first = lambda last: stages[0](jax.tree.unflatten(structure, last))  # noqa: E731
 
     def enter(parts: list[jax.Array]) -> Tree:
@@ -117,7 +116,7 @@ def tiled(
     def solve(value: Tree) -> Tree:
         return _in_turn(steps, value)
 
-    def in_tiles(tile: int, one: Callable) -> Tree:
+    def in_tiles(leaves: list[jax.Array], tile: int, one: Callable) -> Tree:
         count = math.ceil(lanes / tile)
         own = [x for x, s in zip(leaves, shared, strict=True) if not s]
         own = [jnp.pad(x, [(0, count * tile - lanes)] + [(0, 0)] * (x.ndim - 1)) for x in own]
@@ -133,10 +132,9 @@ def tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
-        out = fused(partial(_in_turn, (first, *stages[1:])), leaves, shared)
-        return in_compact_tiles() if out is None else out
+        return fused(partial(_in_turn, (first, *stages[1:])), leaves, shared, in_compact_tiles)
 
-    def in_compact_tiles() -> Tree:
+    def in_compact_tiles(leaves: list[jax.Array]) -> Tree:
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
         largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
         compact = rows > 0 and lanes > size and largest <= LARGEST_LEAF
@@ -151,10 +149,10 @@ def tiled(
                     value = _as_one_function(step, value)
                 return value
 
-        return in_tiles(min(size, lanes), one)
+        return in_tiles(leaves, min(size, lanes), one)
 
     def elsewhere() -> Tree:
-        return in_tiles(min(LARGE_TILE, lanes), solve)
+        return in_tiles(leaves, min(LARGE_TILE, lanes), solve)
 
     if jax.default_backend() == "cpu":
         return on_cpu()

@@ -27,7 +27,11 @@ class MarginProblem(BlockProblem):
     """max lambda; x is (blocks, lambda).
 
     Record: `lower` is attained by `x`, `upper` is certified by (y, z) with sum sigma z = 1.
+
+    cutoff: (*lanes), a lane is finished when its upper bound is below; None for no such thing.
     """
+
+    cutoff: jax.Array | None = None
 
     def attained(self, x: Rows) -> jax.Array:
         """Min (h - A x) / sigma, the lambda that x attains when E x = b.
@@ -134,9 +138,11 @@ class MarginProblem(BlockProblem):
     def gap_scale(self, record: Record) -> jax.Array:
         """Gaps count relative to max(1, |lambda|).
 
-        Where no x attains anything, a negative upper bound says all there is to know.
+        Where no x attains anything, a negative upper bound says all there is to know, and so does one below the cutoff.
         """
         hopeless = jnp.isinf(record.lower) & (record.upper < -1e-6)
+        if self.cutoff is not None:
+            hopeless |= record.upper < self.cutoff
         return jnp.where(
             hopeless, jnp.inf, jnp.maximum(1, jnp.where(jnp.isinf(record.lower), 1, jnp.abs(record.lower)))
         )

@@ -15,6 +15,7 @@ class Status(enum.IntEnum):
     MAX_ITERATIONS = 3
     ILL_CONDITIONED = 4
     INVALID_INPUT = 5
+    PRUNED = 6
 
     @property
     def advice(self) -> str:
@@ -29,4 +30,5 @@ _ADVICE = {
     Status.MAX_ITERATIONS: "Not solved to the tolerance; the bounds still hold. Use float64 or rescale the data.",
     Status.ILL_CONDITIONED: "The rank of the grasp map cannot be told in this precision; use float64.",
     Status.INVALID_INPUT: "The data of this element are not admissible (NaN, zero normal, negative friction ...).",
+    Status.PRUNED: "Given up early, since its upper bound is below the cutoff; the bounds hold.",
 }
