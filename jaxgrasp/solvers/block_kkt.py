@@ -267,23 +267,24 @@ class BlockProblem:
         return Factors(blocks, _inverse_root(complete(matrix, v, border)), weights, border, v)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
-        """Orthogonalise sqrt(W) [A, sigma] column by column.
+        """Orthogonalise [A, sigma] column by column, in the inner product that the weights give.
 
         A'WA itself would square its condition, too much for float32.
         """
         k = g.patterns.shape[1]
-        root = jnp.sqrt(weights)
-        columns = [root * spread_over(g.patterns[:, a], root) for a in range(k)]
+        columns = [jnp.broadcast_to(spread_over(g.patterns[:, a], weights), weights.shape) for a in range(k)]
         if g.hessian is not None:
             columns = [jnp.concatenate([c, g.hessian[:, a]]) for a, c in enumerate(columns)]
+            weights = jnp.concatenate([weights, jnp.ones_like(g.hessian[:, 0])])
         if self.bordered:
-            columns.append(root * g.sigma)
+            columns.append(g.sigma)
 
         @fenced
-        def share(column: jax.Array, others: list[jax.Array]) -> tuple:
-            square = fold(jnp.add, column * column)
+        def share(weights: jax.Array, column: jax.Array, others: list[jax.Array]) -> tuple:
+            pulled = weights * column
+            square = fold(jnp.add, pulled * column)
             inverse = jax.lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny) + (1 - g.present))
-            return inverse, [fold(jnp.add, column * other) * inverse for other in others]
+            return inverse, [fold(jnp.add, pulled * other) * inverse for other in others]
 
         @fenced
         def remove(column: jax.Array, inverse: jax.Array, others: list[jax.Array], shares: list[jax.Array]) -> list:
@@ -293,13 +294,13 @@ class BlockProblem:
         inverse, shares = [], []
         for _ in range(k):
             column, *others = columns
-            own, parts = share(column, others)
+            own, parts = share(weights, column, others)
             columns = remove(column, own, others, parts)
             inverse.append(own)
             shares.append(parts)
         below = [shares[j][i - j - 1] for i in range(k) for j in range(i)]
         theta = [parts[-1] for parts in shares] if self.bordered else []
-        lean = fenced(lambda c: fold(jnp.add, c * c))(columns[0]) if self.bordered else None
+        lean = fenced(lambda w, c: fold(jnp.add, w * c * c))(weights, columns[0]) if self.bordered else None
         reduced = fenced(lambda below, inverse: _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
         return _BlockFactor(below, inverse, reduced(below, inverse), theta, lean)
 
