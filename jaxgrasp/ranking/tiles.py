@@ -45,6 +45,18 @@ def columns_of(candidates: Candidates) -> Columns:
     return columns | candidates.hand
 
 
+def contacts_of(columns: Columns) -> Contacts:
+    """The contacts of candidates by their columns."""
+    make = Contacts.from_frames if "frames" in columns else Contacts.from_normals
+    return make(
+        columns["positions"],
+        columns["frames"] if "frames" in columns else columns["outward_normals"],
+        friction=columns["friction"],
+        max_force=columns["max_force"],
+        active=columns["active"],
+    )
+
+
 def solve_in_tiles(
     solver: Callable[..., Any],
     columns: Columns,
@@ -105,14 +117,7 @@ def _solve_tile(
     columns: Any, disturbances: DisturbanceSet, gravity: Any, solver: Any, cone_edges: int, loaded: bool, mesh: Mesh
 ) -> Any:
     def on_one_device(columns: Any, disturbances: DisturbanceSet, gravity: Any) -> Any:
-        make = Contacts.from_frames if "frames" in columns else Contacts.from_normals
-        contacts = make(
-            columns["positions"],
-            columns["frames"] if "frames" in columns else columns["outward_normals"],
-            friction=columns["friction"],
-            max_force=columns["max_force"],
-            active=columns["active"],
-        )
+        contacts = contacts_of(columns)
         load = columns.get("required_wrench")
         if loaded:
             load = required_wrench(columns["mass"], gravity=jnp.array([0.0, 0.0, -1.0]) * gravity)
