@@ -87,6 +87,11 @@ def edges_of(contacts: Contacts, space: WrenchSpace | None = None) -> Edges:
     space = space or WrenchSpace()
     if int(space.cone_edges) != space.cone_edges or space.cone_edges < 3:
         raise ValueError(f"cone_edges: got {space.cone_edges}, wanted an integer of at least 3")
+    return _edges(contacts, space)
+
+
+@jax.jit
+def _edges(contacts: Contacts, space: WrenchSpace) -> Edges:
     batch, dtype = contacts.batch_shape, contacts.positions.dtype
     given = as_float("reference", np.zeros(3) if space.reference is None else space.reference, (3,)).astype(dtype)
     there = contacts.active

@@ -59,8 +59,8 @@ def score(
     report = progress or (lambda _: None)
     columns, values = columns_of(candidates), np.empty(len(candidates))
     if METRICS[name].batched:
-        tile = None if name == "margin" else _TILE
-        settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": tile}
+        own = name == "margin"
+        settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None if own else _TILE, "spread": own}
         for rows, value in solve_in_tiles(_scorer(name, cone_edges), columns, disturbances, **settings):
             values[rows] = value
             report(rows.stop)
