@@ -86,14 +86,13 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     edges = edges_of(contacts, space)
     dual = _dual(edges)
     least = _weight(edges, dual)
-    counted = jnp.maximum(edges.counted.sum(-1), 1)
     dtype = edges.wrenches.dtype
     left, singular, _ = jnp.linalg.svd(jnp.swapaxes(edges.flat, -1, -2), full_matrices=False)
     if singular.shape[-1] < 6:
         spans = jnp.zeros(edges.valid.shape, bool)
     else:
         spans = singular[..., 5] > RANK_TOLERANCE[dtype.name] * singular[..., 0]
-    positive = least * counted > _LEAST_WEIGHT[dtype.name]
+    positive = least * _count(edges) > _LEAST_WEIGHT[dtype.name]
     known = edges.valid & (dual.status != Status.MAX_ITERATIONS)
     closed = known & spans & positive
     # The multipliers are what the weights exceed the least one by.
@@ -118,9 +117,8 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
 def _dual(edges: Edges) -> QPSolution:
     """Min nu over (y, nu) with w_k'y <= nu, nu - y'mean w = 1: nu is the number of edges times the min-weight."""
     counted, W = edges.counted, edges.flat
-    count = jnp.maximum(counted.sum(-1), 1).astype(W.dtype)
     rows = jnp.concatenate([W, -counted[..., None].astype(W.dtype)], -1)
-    mean = W.sum(-2) / count[..., None]
+    mean = W.sum(-2) / _count(edges)[..., None]
     # Without any contact the row is zero, and the program infeasible.
     equality = jnp.concatenate([-mean, counted.any(-1)[..., None].astype(W.dtype)], -1)
     cost = jnp.zeros((*edges.valid.shape, 7), W.dtype).at[..., 6].set(1)
@@ -129,11 +127,15 @@ def _dual(edges: Edges) -> QPSolution:
 
 
 def _weight(edges: Edges, dual: QPSolution) -> jax.Array:
-    count = jnp.maximum(edges.counted.sum(-1), 1)
     none = (dual.status == Status.UNBOUNDED) | (dual.status == Status.INFEASIBLE)
     solved = dual.status == Status.SOLVED
-    value = jnp.where(solved, dual.objective, 0) / count
+    value = jnp.where(solved, dual.objective, 0) / _count(edges)
     return hidden(edges, jnp.where(none, -jnp.inf, jnp.where(solved, value, jnp.nan)))
+
+
+def _count(edges: Edges) -> jax.Array:
+    """How many edges there are, at least 1."""
+    return jnp.maximum(edges.counted.sum(-1, dtype=edges.wrenches.dtype), 1)
 
 
 def _orthogonal(left: jax.Array) -> jax.Array:

@@ -7,8 +7,6 @@ from matplotlib.figure import Figure
 
 from jaxgrasp.ranking import Comparison
 
-_DASHES = ("-", "--", ":", "-.")
-
 
 def figure_of_comparison(comparison: Comparison, *, outcome: str = "success") -> Figure:
     """Draws the matrix of rank correlations, ROC curves, and areas under them with their intervals.
@@ -32,10 +30,11 @@ def figure_of_comparison(comparison: Comparison, *, outcome: str = "success") ->
     curves, areas = right.subplots(1, 2, width_ratios=(1.25, 1))
     colours = colormaps["tab20"](np.arange(count) % 20)
     for number, (name, curve) in enumerate(zip(comparison.names, prediction.curves, strict=True)):
-        curves.plot(*curve.T, color=colours[number], linestyle=_DASHES[number % 4], linewidth=1.4, label=name)
+        curves.plot(*curve.T, color=colours[number], linewidth=1.4, label=name)
     curves.plot([0, 1], [0, 1], color="0.7", linewidth=0.8)
     curves.set(xlabel="share of the failures kept", ylabel="share of the successes kept", xlim=(0, 1), ylim=(0, 1.01))
     curves.set_aspect("equal")
+    curves.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, fontsize=7, frameon=False)
     good = int(prediction.success.sum())
     curves.set_title(f"ROC: {outcome}, {good:,} of {len(prediction.success):,}", fontsize=10)
     places = np.arange(count)[::-1]
