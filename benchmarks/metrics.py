@@ -202,8 +202,8 @@ def text(stored: dict, everywhere: Comparison, within: Comparison, rates: list[d
         "",
         *paragraph(
             f"""{count} recorded grasps with the min-weight and the Ferrari-Canny metric (L1) that their source
-            computed: four edges of unit norm, N m about the origin of the mesh, and the first tangent (1.2, 2.3, 3.4) made
-            orthogonal to the normal, on which coarse pyramids depend."""
+            computed: four edges of unit norm, N m about the origin of the mesh, and the first tangent (1.2, 2.3, 3.4)
+            made orthogonal to the normal, on which coarse pyramids depend."""
         ),
         "",
         "| | within 1 % of the stored one |",
@@ -214,8 +214,8 @@ def text(stored: dict, everywhere: Comparison, within: Comparison, rates: list[d
         "",
         *paragraph(
             f"""The other {np.sum(~both)}: {by_object}; {baseline} of them by the baseline generator. Contacts and
-            normals were derived from the source's files, so where a surface bends sharply the normals may be others than those
-            that the source used. The least turn of the four normals that would explain the difference of the
+            normals were derived from the source's files, so where a surface bends sharply the normals may be others
+            than those that the source used. The least turn of the four normals that would explain the difference of the
             min-weight, to first order by its gradient (root of the sum of squares):
             {np.median(needed[~far]):.3f} degrees in the median of the grasps that agree,
             {np.median(needed[far]):.2f} in the median of those that do not (from {needed[far].min():.3f} to
@@ -258,8 +258,8 @@ def text(stored: dict, everywhere: Comparison, within: Comparison, rates: list[d
         "",
         *paragraph(
             f"""{BATCH:,} random grasps of four contacts, eight edges, float64, one call of `jax.jit` on one device,
-            warm, best of three; beside it one grasp after the other by other means, the first {LOOPED} of them, in the same
-            process."""
+            warm, best of three; beside it one grasp after the other by other means, the first {LOOPED} of them, in the
+            same process."""
         ),
         "",
         "| metric | grasps/s | compiling, s | one by one | grasps/s | ratio | |",
