@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.fence import fenced
+from jaxgrasp.fence import fenced, repeat
 from jaxgrasp.solvers import cones
 from jaxgrasp.solvers.block_kkt import inverse_root, spread_over
 from jaxgrasp.solvers.cones import Scaling
@@ -33,6 +33,8 @@ _MAX_ITERATIONS = 60
 _PATIENCE = 6
 # Share of the way to the boundary.
 _STEP = 0.98
+# Steps of iterative refinement of every Newton direction.
+_REFINEMENTS = 1
 # Axes up to this length are reduced term by term.
 _SPELT_OUT = 16
 
@@ -191,6 +193,7 @@ class _Factors(NamedTuple):
 
 class _Carry(NamedTuple):
     state: _State
+    residuals: _Residuals
     best: ConicOutcome
     stalled: jax.Array
     active: jax.Array
@@ -228,25 +231,27 @@ def solve(problem: ConicMargin, tolerance: float, active: jax.Array) -> ConicOut
     )
 
     def body(carry: _Carry) -> _Carry:
-        stepped = _step(problem, carry.state, units, degree)
+        stepped = _step(problem, carry.state, carry.residuals, units, degree)
         fine = carry.active & jnp.isfinite(_total(stepped))
         state = _where(fine, stepped, carry.state)
-        found = _assessed(problem, state, carry.best, tolerance)
+        residuals = _residuals(problem, state)
+        found = _assessed(problem, state, residuals, carry.best, tolerance)
         better = found.error < 0.9 * carry.best.error
         found = found._replace(iterations=carry.best.iterations + 1)
         best = _where(carry.active, found, carry.best)
         stalled = jnp.where(better, 0, carry.stalled + 1)
         done = (best.error <= tolerance) | best.infeasible | (stalled >= _PATIENCE) | ~fine
-        return _Carry(state, best, stalled, carry.active & ~done, carry.step + 1)
+        return _Carry(state, residuals, best, stalled, carry.active & ~done, carry.step + 1)
 
-    first = _Carry(state, best, jnp.zeros(lanes, jnp.int32), active, jnp.zeros((), jnp.int32))
+    first = _Carry(state, _residuals(problem, state), best, jnp.zeros(lanes, jnp.int32), active, jnp.zeros((), jnp.int32))
     return lax.while_loop(lambda c: (c.step < _MAX_ITERATIONS) & jnp.any(c.active), body, first).best
 
 
 @fenced
-def _assessed(problem: ConicMargin, state: _State, best: ConicOutcome, tolerance: float) -> ConicOutcome:
+def _assessed(
+    problem: ConicMargin, state: _State, r: _Residuals, best: ConicOutcome, tolerance: float
+) -> ConicOutcome:
     """The best point with this one taken into account."""
-    r = _residuals(problem, state)
     inverse = 1 / state.tau
     primal = jnp.maximum(fold(jnp.maximum, jnp.abs(r.y)), _most([jnp.abs(v) for v in r.rows])) * inverse
     dual = jnp.maximum(fold(jnp.maximum, fold(jnp.maximum, jnp.abs(r.x))), jnp.abs(r.lam)) * inverse
@@ -289,84 +294,81 @@ def _residuals(problem: ConicMargin, state: _State) -> _Residuals:
     )
 
 
-def _step(problem: ConicMargin, state: _State, units: Parts, degree: float) -> _State:
-    """A predictor, a corrector, and a step along it."""
+def _step(problem: ConicMargin, state: _State, residuals: _Residuals, units: Parts, degree: float) -> _State:
+    """A predictor, a corrector, and a step along it.
+
+    Directions are a solution for the residuals plus dtau times one for the constants (c, b, h): three solves, in a loop
+    so that the program has each of them once.
+    """
     kinds = [part.second_order for part in problem.rows]
-    residuals = _residuals(problem, state)
 
     @fenced
-    def scale(s: Parts, z: Parts) -> tuple[Scaling, ...]:
-        return tuple(cones.scaling(kind, s_p, z_p) for kind, s_p, z_p in zip(kinds, s, z, strict=True))
+    def scale(s: Parts, z: Parts) -> tuple:
+        scalings = tuple(cones.scaling(kind, s_p, z_p) for kind, s_p, z_p in zip(kinds, s, z, strict=True))
+        return scalings, (_inner(s, z) + state.tau * state.kappa) / degree
 
-    scalings = scale(state.s, state.z)
+    scalings, mu = scale(state.s, state.z)
     factors = _factor(problem, scalings)
-    sides = tuple(jnp.broadcast_to(-part.sides(), s.shape) for part, s in zip(problem.rows, state.s, strict=True))
-    zero = jnp.zeros_like(state.lam)
-    constant, rows, z = _newton(problem, scalings, factors, jnp.zeros_like(state.x), 1 + zero, problem.rhs, sides)
-    # = lambda_1 - b'y_1 - h'z_1, without its cancellation.
-    bend = fenced(_inner)(rows, z)
-    mu = fenced(lambda s: (_inner(s.s, s.z) + s.tau * s.kappa) / degree)(state)
 
-    def direction(remaining: jax.Array, aims: Parts, aim: jax.Array) -> tuple:
-        """For scaled right-hand sides `aims` = lambda \\ d_s and `aim` = d_kappa."""
-
-        @fenced
-        def sides(aims: Parts) -> Parts:
-            return tuple(
-                remaining * r + cones.stretch(w, a) for r, w, a in zip(residuals.rows, scalings, aims, strict=True)
-            )
-
-        own, _, dz = _newton(
-            problem,
-            scalings,
-            factors,
-            -remaining * residuals.x,
-            -remaining * residuals.lam,
-            remaining * residuals.y,
-            sides(aims),
+    @fenced
+    def right_sides(i: jax.Array, remaining: jax.Array, aims: Parts) -> tuple:
+        first = i == 0
+        sides = tuple(
+            jnp.where(first, -part.sides(), remaining * r + cones.stretch(w, a))
+            for part, r, w, a in zip(problem.rows, residuals.rows, scalings, aims, strict=True)
         )
-
-        @fenced
-        def combine(own: tuple, dz: Parts) -> tuple:
-            value = fold(jnp.add, problem.rhs * own[2]) + _inner([part.sides() for part in problem.rows], dz)
-            lacking = remaining * residuals.tau + aim / state.tau - own[1] + value
-            dtau = lacking / (state.kappa / state.tau + bend)
-            x, lam, y = (a + dtau * c for a, c in zip(own, constant, strict=True))
-            dz = tuple(a + dtau * c for a, c in zip(dz, z, strict=True))
-            scaled = tuple(cones.stretch(w, d) for w, d in zip(scalings, dz, strict=True))
-            slack = tuple(a - d for a, d in zip(aims, scaled, strict=True))
-            return x, lam, y, slack, scaled, dz, dtau, (aim - state.kappa * dtau) / state.tau
-
-        return combine(own, dz)
+        rhs_lam = jnp.where(first, 1, -remaining * residuals.lam)
+        return -remaining * residuals.x, rhs_lam, jnp.where(first, problem.rhs, remaining * residuals.y), sides
 
     @fenced
-    def longest(slack: Parts, scaled: Parts, dtau: jax.Array, dkappa: jax.Array) -> jax.Array:
-        over = [_most([cones.overshoot(w, d)]) for w, d in zip(scalings, slack, strict=True)]
-        over += [_most([cones.overshoot(w, d)]) for w, d in zip(scalings, scaled, strict=True)]
-        return fold(jnp.maximum, [*over, -dtau / state.tau, -dkappa / state.kappa])
-
-    _, _, _, slack, scaled, _, dtau, dkappa = direction(1 + zero, tuple(-w.value for w in scalings), -state.tau * state.kappa)
-    reach = 1 / jnp.maximum(longest(slack, scaled, dtau, dkappa), 1)
-    centring = (1 - reach) ** 3
+    def combine(own: tuple, constant: tuple, bend: jax.Array, remaining: jax.Array, aims: Parts, aim: jax.Array) -> tuple:
+        _, _, y, z, _ = own
+        value = fold(jnp.add, problem.rhs * y) + _inner([part.sides() for part in problem.rows], z)
+        lacking = remaining * residuals.tau + aim / state.tau - own[1] + value
+        dtau = lacking / (state.kappa / state.tau + bend)
+        x, lam, y, z, rows = jax.tree.map(lambda a, c: a + dtau * c, own, constant)
+        # From the rows, so that these are met whatever rounding does to W: lambda-wise it is aims - W dz.
+        s = tuple(cones.stretch(w, a) - r for w, a, r in zip(scalings, aims, rows, strict=True))
+        scaled = tuple(cones.stretch(w, d) for w, d in zip(scalings, z, strict=True))
+        slack = tuple(cones.shrink(w, d) for w, d in zip(scalings, s, strict=True))
+        dkappa = (aim - state.kappa * dtau) / state.tau
+        over = [_most([cones.overshoot(w, d)]) for w, d in zip(scalings * 2, slack + scaled, strict=True)]
+        over = fold(jnp.maximum, [*over, -dtau / state.tau, -dkappa / state.kappa])
+        return _State(x, lam, y, s, z, dtau, dkappa), slack, scaled, over
 
     @fenced
-    def correct(slack: Parts, scaled: Parts) -> Parts:
-        return tuple(
-            cones.quotient(w, centring * mu * e - cones.product(kind, a, b)) - w.value
+    def correct(i: jax.Array, direction: _State, slack: Parts, scaled: Parts, over: jax.Array) -> tuple:
+        """What the next direction aims at: lambda \\ d_s and d_kappa; after the constants, the boundary itself."""
+        first = i == 0
+        centring = jnp.where(first, 0, (1 - 1 / jnp.maximum(over, 1)) ** 3)
+        second = jnp.where(first, 0, 1)
+        aims = tuple(
+            cones.quotient(w, centring * mu * e - second * cones.product(kind, a, b)) - w.value
             for kind, w, a, b, e in zip(kinds, scalings, slack, scaled, units, strict=True)
         )
+        aim = centring * mu - state.tau * state.kappa - second * direction.tau * direction.kappa
+        return 1 - centring, aims, aim
 
-    aim = centring * mu - state.tau * state.kappa - dtau * dkappa
-    dx, dlam, dy, slack, scaled, dz, dtau, dkappa = direction(1 - centring, correct(slack, scaled), aim)
-    alpha = _STEP / jnp.maximum(longest(slack, scaled, dtau, dkappa), _STEP)
+    def phase(i: jax.Array, carry: tuple) -> tuple:
+        constant, bend, (remaining, aims, aim), _, _ = carry
+        own = _newton(problem, scalings, factors, *right_sides(i, remaining, aims))
+        constant = _where(i == 0, own, constant)
+        # = lambda_1 - b'y_1 - h'z_1, without its cancellation.
+        bend = jnp.where(i == 0, fenced(_inner)(own[4], own[3]), bend)
+        direction, slack, scaled, over = combine(own, constant, bend, remaining, aims, aim)
+        return constant, bend, correct(i, direction, slack, scaled, over), direction, over
+
+    zero = jnp.zeros_like(state.lam)
+    nothing = jax.tree.map(jnp.zeros_like, state)
+    start = (nothing.x, zero, nothing.y, nothing.z, nothing.s), zero, (zero, nothing.s, zero), nothing, zero
+    *_, direction, over = repeat(3, phase, start)
 
     @fenced
-    def advance(state: _State, alpha: jax.Array) -> _State:
-        ds = tuple(cones.stretch(w, d) for w, d in zip(scalings, slack, strict=True))
-        moves = _State(dx, dlam, dy, ds, dz, dtau, dkappa)
-        return jax.tree.map(lambda a, d: a + alpha * d, state, moves)
+    def advance(state: _State, direction: _State, over: jax.Array) -> _State:
+        alpha = _STEP / jnp.maximum(over, _STEP)
+        return jax.tree.map(lambda a, d: a + alpha * d, state, direction)
 
-    return advance(state, alpha)
+    return advance(state, direction, over)
 
 
 def _factor(problem: ConicMargin, scalings: tuple[Scaling, ...]) -> _Factors:
@@ -408,7 +410,7 @@ def _newton(
     rhs_y: jax.Array,
     sides: Parts,
 ) -> tuple:
-    """(x, lambda, y), the rows A x + sigma lambda + sides, and z = W^-2 of these, with
+    """(x, lambda, y, z) and the rows r = A x + sigma lambda + sides, with z = W^-2 r and
 
     A'z + E'y = rhs_x, sigma'z + w'y = rhs_lam, E x + w lambda = rhs_y.
     """
@@ -434,8 +436,24 @@ def _newton(
         lhs = tuple(a + u for a, u in zip(problem.apply(x, lam), sides, strict=True))
         return lhs, tuple(cones.weigh(w, v) for w, v in zip(scalings, lhs, strict=True))
 
-    x, lam, y = eliminate(*reduce(rhs_x, rhs_lam, sides), rhs_y)
-    return (x, lam, y), *rows(x, lam, sides)
+    @fenced
+    def lacking(x: jax.Array, lam: jax.Array, y: jax.Array, z: Parts) -> tuple:
+        pulled, along = problem.adjoint(z)
+        own_lam = rhs_lam - along - fold(jnp.add, problem.border * y)
+        return rhs_x - pulled - problem.pull_back(y), own_lam, rhs_y - problem.equality(x, lam)
+
+    def improve(_: jax.Array, carry: tuple) -> tuple:
+        (x, lam, y), right, lhs, z, sides = carry
+        more = eliminate(*right)
+        more_lhs, more_z = rows(more[0], more[1], sides)
+        x, lam, y, lhs, z = jax.tree.map(jnp.add, (x, lam, y, lhs, z), (*more, more_lhs, more_z))
+        return (x, lam, y), lacking(x, lam, y, z), lhs, z, jax.tree.map(jnp.zeros_like, sides)
+
+    nothing = jnp.zeros_like(rhs_x), jnp.zeros_like(rhs_lam), jnp.zeros_like(rhs_y)
+    none = jax.tree.map(jnp.zeros_like, sides)
+    start = nothing, (*reduce(rhs_x, rhs_lam, sides), rhs_y), none, none, sides
+    (x, lam, y), _, lhs, z, _ = repeat(1 + _REFINEMENTS, improve, start)
+    return x, lam, y, z, lhs
 
 
 def _cholesky(entries: list[jax.Array]) -> list[jax.Array]:
