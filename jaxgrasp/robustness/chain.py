@@ -7,7 +7,7 @@ force (15), one f_0 is shared: the rows come in copies, one for each direction a
 Per contact forces are scaled as in `program`: tangential by mu F, normal by F.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -48,8 +48,33 @@ FORMULATIONS = {
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
+class Basics:
+    """What all formulations share; lanes trail."""
+
+    sizes: jax.Array
+    """(3, n, *lanes), N: forces = sizes * x."""
+    columns: jax.Array
+    """(6, 3, n, *lanes), the orthonormal rows of G for scaled forces; zero where dropped."""
+    dropped: jax.Array
+    """(6, *lanes), 1 where a row was dropped."""
+    load: jax.Array
+    """(6, *lanes), b in the orthonormal rows."""
+    targets: jax.Array
+    """(6, n_d, *lanes), W_j in them."""
+    answers: jax.Array | None
+    """(n_d, 3, n, *lanes): blocking forces for lambda = 1, N; None where no formulation asks for them."""
+    disturbed: jax.Array
+    """bool (n_d, *lanes): W_j is not zero."""
+    outside: jax.Array
+    """bool (n_d, *lanes): W_j is outside the range of G."""
+    load_outside: jax.Array
+    """bool (*lanes): b is."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
 class Scaled:
-    """The programs of a batch of grasps; lanes are (programs of a grasp, grasps).
+    """The programs of one formulation; lanes are (programs of a grasp, grasps).
 
     Free answers: one program a direction, then that of f_0. Blocking forces: one program, or one a direction.
     """
@@ -57,21 +82,10 @@ class Scaled:
     problem: ConicMargin
     scale: jax.Array
     """(D, *lanes): lambda = scale * lambda_hat."""
-    sizes: jax.Array
-    """(3, n, *lanes), N: forces = sizes * x."""
-    answers: jax.Array | None
-    """(n_d, 3, n, *lanes): blocking forces for lambda = 1; None where the answer is free."""
-    disturbed: jax.Array
-    """bool (n_d, *lanes): W_j is not zero."""
-    outside: jax.Array
-    """bool (n_d, *lanes): W_j is outside the range of G."""
-    wrench_outside: jax.Array
-    """bool (*lanes): b is."""
-    free: bool = field(metadata={"static": True})
 
 
-def scaled_formulation(grasps: Grasps, form: Formulation, cone_edges: int, norm_bound: bool) -> Scaled:
-    """Scale the programs of one formulation for a batch of grasps."""
+def basics(grasps: Grasps, with_answers: bool) -> Basics:
+    """Scale a batch of grasps."""
     dtype, present = grasps.present.dtype, grasps.present
     tolerance = 10 * RANK_TOLERANCE[dtype.name]
     tangential = jnp.maximum(grasps.friction, LEAST_FRICTION[dtype.name]) * grasps.max_force
@@ -80,71 +94,72 @@ def scaled_formulation(grasps: Grasps, form: Formulation, cone_edges: int, norm_
     mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
     rows = whitened(grasps.columns * (sizes / mean))
     (lanes,) = mean.shape
-    # (6, n_d, *lanes), and what of it lies outside the range.
-    wrenches = jnp.swapaxes(jnp.broadcast_to(grasps.terms[0].wrenches, (*grasps.terms[0].wrenches.shape[:2], lanes)), 0, 1)
-    wrenches = wrenches * grasps.units[:, None]
+    given = grasps.terms[0].wrenches
+    wrenches = jnp.swapaxes(jnp.broadcast_to(given, (*given.shape[:2], lanes)), 0, 1) * grasps.units[:, None]
 
     def coordinates(wrench: jax.Array) -> tuple[jax.Array, jax.Array]:
         """In the orthonormal rows, and whether something is left outside them."""
         spread = lambda x: x.reshape(*x.shape[:-1], *[1] * (wrench.ndim - 2), lanes)  # noqa: E731
         own = fold(jnp.add, [spread(rows.operations[:, c]) * wrench[c] for c in range(6)])
-        kept = spread(rows.kept)
-        lost = fold(jnp.maximum, jnp.abs(lax.stop_gradient(own)) * (1 - kept))
-        return own * kept, lost > tolerance * fold(jnp.maximum, jnp.abs(wrench))
+        lost = fold(jnp.maximum, jnp.abs(lax.stop_gradient(own)) * (1 - spread(rows.kept)))
+        return own * spread(rows.kept), lost > tolerance * fold(jnp.maximum, jnp.abs(wrench))
 
-    rhs, wrench_outside = coordinates(grasps.wrench / mean)
+    load, load_outside = coordinates(grasps.wrench / mean)
     targets, outside = coordinates(wrenches / mean)
-    disturbed = fold(jnp.maximum, jnp.abs(wrenches)) > 0
-    count = disturbed.shape[0]
+    return Basics(
+        sizes=sizes,
+        columns=rows.rows,
+        dropped=1 - rows.kept,
+        load=load,
+        targets=targets,
+        answers=blocking(grasps, wrenches) if with_answers else None,
+        disturbed=fold(jnp.maximum, jnp.abs(wrenches)) > 0,
+        outside=outside,
+        load_outside=load_outside,
+    )
+
+
+def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_edges: int, norm_bound: bool) -> Scaled:
+    """The programs of one formulation for a batch of grasps."""
+    present, dtype = grasps.present, grasps.present.dtype
+    count, lanes = basics.disturbed.shape
     parts = _patterns(form.exact, cone_edges, norm_bound, grasps.friction)
-    answers = None
+    kinds = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
     if form.free:
-        length = jnp.sqrt(lax.stop_gradient(fold(jnp.add, targets * targets)))
+        length = jnp.sqrt(lax.stop_gradient(fold(jnp.add, basics.targets * basics.targets)))
         scale = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 1)
-        border = jnp.concatenate([targets * scale, jnp.zeros((6, 1, lanes), dtype)], 1)
+        border = jnp.concatenate([basics.targets * scale, jnp.zeros((6, 1, lanes), dtype)], 1)
         scale = jnp.concatenate([scale, jnp.ones((1, lanes), dtype)])
         # The last program is for f_0: how deep inside all rows it can be.
         last = (jnp.arange(count + 1) == count).astype(dtype)[:, None]
-        sigmas = [
-            _identity(part.second_order, len(part.h), dtype) * (present[:, None] * last)[None, None] for part in parts
-        ]
+        sigmas = [kind * last for kind in kinds]
     else:
-        answers = blocking(grasps, wrenches)
         border = jnp.zeros((6, 1 if form.shared else count, lanes), dtype)
-        given = jnp.moveaxis(answers / sizes, 0, 2)  # (3, n, n_d, *lanes)
+        given = jnp.moveaxis(basics.answers / basics.sizes, 0, 2)
         sigmas = [jnp.where(present[:, None] > 0, part.apply(given), 0) for part in parts]
         largest = fold(jnp.maximum, [jnp.max(jnp.abs(sigma), (0, 1, 2)) for sigma in sigmas])
         if form.shared:
             largest = jnp.max(largest, 0, keepdims=True)
-            # (d, 1, n, n_d, *lanes): directions become copies.
+            # Directions become copies, (d, n_d, n, 1, *lanes).
             sigmas = [jnp.swapaxes(sigma, 1, 3) for sigma in sigmas]
-        scale = lax.stop_gradient(1 / jnp.where(largest > 0, largest, 1))
+        # Where nothing disturbs, lambda asks how deep inside all rows f_0 can be.
         idle = largest == 0
-        kinds = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
-        rest = [jnp.zeros_like(sigma[:, :1]) for sigma in sigmas]
+        scale = lax.stop_gradient(1 / jnp.where(idle, 1, largest))
         sigmas = [
-            jnp.concatenate([jnp.where(idle, one, sigma * scale), jnp.where(idle, one, none)], 1)
-            for sigma, one, none in zip(sigmas, kinds, rest, strict=True)
+            jnp.concatenate(
+                [jnp.where(idle, kind, sigma * scale), jnp.where(idle, kind, jnp.zeros_like(sigma[:, :1]))], 1
+            )
+            for sigma, kind in zip(sigmas, kinds, strict=True)
         ]
-    programs = border.shape[1]
-    lift = lambda sigma: jnp.broadcast_to(sigma, (*sigma.shape[:3], programs, lanes))  # noqa: E731
+    lift = lambda sigma: jnp.broadcast_to(sigma, (*sigma.shape[:3], *border.shape[1:]))  # noqa: E731
     problem = ConicMargin(
         rows=tuple(replace(part, sigma=lift(sigma)) for part, sigma in zip(parts, sigmas, strict=True)),
-        columns=rows.rows[..., None, :],
+        columns=basics.columns[..., None, :],
         border=border,
-        rhs=jnp.broadcast_to(rhs[:, None], border.shape),
-        dropped=(1 - rows.kept)[:, None],
+        rhs=jnp.broadcast_to(basics.load[:, None], border.shape),
+        dropped=basics.dropped[:, None],
     )
-    return Scaled(
-        problem=problem,
-        scale=scale,
-        sizes=sizes,
-        answers=answers,
-        disturbed=disturbed,
-        outside=outside,
-        wrench_outside=wrench_outside,
-        free=form.free,
-    )
+    return Scaled(problem=problem, scale=scale)
 
 
 def blocking(grasps: Grasps, wrenches: jax.Array) -> jax.Array:

@@ -9,12 +9,11 @@ delta f_j is free or the blocking force (15).
 """
 
 from dataclasses import dataclass, fields
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import Compliance
@@ -22,11 +21,12 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices
-from jaxgrasp.robustness.chain import FORMULATIONS, Scaled, scaled_formulation
+from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Formulation, Scaled, basics, scaled_formulation
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along
-from jaxgrasp.solvers import conic_margin
-from jaxgrasp.solvers.conic_margin import ConicOutcome, ConicPoint
+from jaxgrasp.solvers import embedding
+from jaxgrasp.solvers.conic_margin import ConicMargin, ConicPoint
+from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.status import Status
 
 _TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
@@ -124,8 +124,9 @@ def formulation_margin(
         raise ValueError(f"force_bound: got 'norm' for {formulation!r}, wanted 'normal', since pyramids are linear")
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
-    kernel = _LargestBy(formulation, cone_edges, force_bound == "norm")
-    return over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)[0]
+    kernel = Chain((formulation,), cone_edges, force_bound == "norm")
+    solved = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)
+    return solved[formulation][0]
 
 
 def check_vertices(disturbances: DisturbanceSet) -> None:
@@ -138,149 +139,182 @@ def check_vertices(disturbances: DisturbanceSet) -> None:
 
 
 @dataclass(frozen=True)
-class _LargestBy:
-    """The kernel of one formulation."""
+class Chain:
+    """The kernel of some formulations; its results are pairs of a solution and a scaled point, by name."""
 
-    formulation: str
+    names: tuple[str, ...]
     cone_edges: int
     norm_bound: bool
     compact = False
 
     @property
     def rows(self) -> int:
+        """See `Kernel`."""
         return self.cone_edges
 
     @property
     def stages(self) -> tuple:
         """See `Kernel`."""
-        return (lambda grasps, _: (grasps, self._scaled(grasps)), lambda given: self._solve(*given))
+        return (lambda grasps, _: (grasps, *self._scaled(grasps)), lambda given: self._solve(*given))
 
-    def tangents(self, along: Along, out: tuple) -> tuple:
+    def tangents(self, along: Along, out: dict) -> dict:
         """See `Kernel`."""
-        solution, point = out
-        margin, directions = along.adjoint(self._adjoint, (solution, point), (solution.margin, solution.directions))
-        changes = {"margin": margin, "upper_bound": margin, "directions": directions}
-        still = ConicPoint(None, None, None, (None,) * len(point.z))
-        return FormulationSolution(**{f.name: changes.get(f.name) for f in fields(solution)}), still
+        values = {name: (solution.margin, solution.directions) for name, (solution, _) in out.items()}
+        changes = along.adjoint(self._adjoint, out, values)
+        changed = {}
+        for name, (solution, point) in out.items():
+            margin, directions = changes[name]
+            moved = {"margin": margin, "upper_bound": margin, "directions": directions}
+            still = ConicPoint(None, None, None, (None,) * len(point.z))
+            changed[name] = FormulationSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), still
+        return changed
 
-    def _scaled(self, grasps: Grasps) -> Scaled:
-        return scaled_formulation(grasps, FORMULATIONS[self.formulation], self.cone_edges, self.norm_bound)
+    def _scaled(self, grasps: Grasps) -> tuple[Basics, dict[str, Scaled]]:
+        """By name; formulations that solve the same programs share them."""
+        forms = {name: FORMULATIONS[name] for name in self.names}
+        shared = basics(grasps, any(not form.free for form in forms.values()))
+        found: dict[str, Scaled] = {}
+        for name, form in forms.items():
+            if self._twin(name) == name:
+                norm_bound = self.norm_bound and form.exact
+                found[name] = scaled_formulation(grasps, shared, form, self.cone_edges, norm_bound)
+        return shared, found
 
-    def _solve(self, grasps: Grasps, scaled: Scaled) -> tuple[FormulationSolution, ConicPoint]:
-        form, problem = FORMULATIONS[self.formulation], scaled.problem
-        dtype = scaled.scale.dtype
-        accepted = _ACCEPTED[dtype.name]
-        count, rest = scaled.disturbed.shape[0], slice(-1, None)
-        runs = jnp.broadcast_to(grasps.valid & ~scaled.wrench_outside, scaled.scale.shape)
-        if form.free:
-            runs &= jnp.concatenate([scaled.disturbed & ~scaled.outside, jnp.ones_like(runs[rest])])
-        out = conic_margin.solve(problem, _TOLERANCE[dtype.name], runs)
-        size = jnp.maximum(1, jnp.abs(out.point.margin))
-        solved = (out.error <= accepted) & ~out.infeasible
-        value, bound = jnp.minimum(out.point.margin, out.upper), out.upper
-        # What is zero to the tolerance is zero.
-        value = jnp.where(solved & (jnp.abs(value) <= accepted), jnp.maximum(value, 0), value)
-        hopeless = out.infeasible | (solved & (value < 0)) | (bound < -accepted)
-        known = solved | hopeless
+    def _twin(self, name: str) -> str:
+        """The formulation whose programs this one shares: with free answers, an f_0 for all costs nothing more."""
+        form = FORMULATIONS[name]
+        return next(o for o in self.names if FORMULATIONS[o][:2] == form[:2] and (form.free or o == name))
 
-        if form.free:
-            holds = known[-1] & ~hopeless[-1]
-            lost = known[-1] & hopeless[-1]
-            own_known = known[:-1] | ~scaled.disturbed | scaled.outside
-            fails = hopeless[:-1] & scaled.disturbed & ~scaled.outside
-            # Directions that contact forces do not reach: only none of it can be borne, by an admissible f_0.
-            fails |= scaled.outside & lost
-            unknown = ~own_known.all(0)
-            if form.shared:
-                infeasible, unknown = lost, unknown | ~known[-1] | (holds & fails.any(0))
-            else:
-                infeasible, unknown = fails.any(0), unknown | (scaled.outside.any(0) & ~known[-1])
-            idle = ~scaled.disturbed.any(0)
-            infeasible |= idle & lost
-            unknown |= idle & ~known[-1]
-        else:
-            infeasible, unknown = hopeless.any(0), ~known.all(0)
-        each = lambda v: jnp.broadcast_to(v[:count] if v.shape[0] != 1 else v, scaled.disturbed.shape)  # noqa: E731
-        scale = scaled.scale
-        told = lambda v: jnp.where(scaled.outside, 0, jnp.where(scaled.disturbed, each(v * scale), jnp.inf))  # noqa: E731
-        directions, upper = told(value), told(bound)
-        undisturbed = ~scaled.disturbed.any(0)
-        decided = [
-            (~grasps.valid, Status.INVALID_INPUT),
-            (scaled.wrench_outside | infeasible, Status.INFEASIBLE),
-            (unknown, Status.MAX_ITERATIONS),
-            (undisturbed, Status.UNBOUNDED),
-        ]
-        status = jnp.select([c for c, _ in decided], [s for _, s in decided], Status.SOLVED).astype(jnp.int32)
-        answered = (status == Status.SOLVED) | (status == Status.UNBOUNDED)
-        hide = lambda v: jnp.where(answered, v, jnp.nan)  # noqa: E731
-        if not (form.free or form.shared):
-            # Each direction has its own program: an f_0 that fails one of them fails all.
-            directions = jnp.where(scaled.disturbed, directions, jnp.inf)
-        margin, worst = jnp.min(directions, 0), jnp.argmin(directions, 0)
-        upper = jnp.maximum(jnp.min(upper, 0), margin)
-        program = worst if scale.shape[0] > 1 else jnp.zeros_like(worst)
-        forces, disturbed = _forces(scaled, form.shared, out, directions, margin, program)
-        finite = answered & ~undisturbed & ~scaled.outside.any(0)
-        direction, contact, row = _binding(scaled, out.point, program, finite)
-        binds = _pick(scale, program)
-        solution = FormulationSolution(
-            margin=hide(margin),
-            upper_bound=hide(upper),
-            directions=hide(directions),
-            forces=jnp.where(answered, jnp.moveaxis(forces * grasps.present, 1, 0), jnp.nan),
-            disturbed_forces=jnp.where(answered, jnp.moveaxis(disturbed * grasps.present, 2, 1), jnp.nan),
-            status=status,
-            direction=jnp.where(finite & (direction < 0), worst if form.free else direction, direction)
-            if form.free
-            else direction,
-            contact=contact,
-            row=row,
-            iterations=jnp.max(out.iterations, 0),
-            primal_residual=hide(jnp.max(jnp.where(runs, out.residual, 0), 0)),
-            gap=hide(jnp.where(finite, (upper - margin) / jnp.maximum(binds, margin), 0)),
-        )
-        return solution, jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-2], *scale.shape)), out.point)
+    def _solve(self, grasps: Grasps, shared: Basics, scaled: dict[str, Scaled]) -> dict:
+        solved = {name: _outcome(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
+        answers = {}
+        for name in self.names:
+            twin = self._twin(name)
+            solution = _answer(grasps, shared, scaled[twin], FORMULATIONS[name], solved[twin])
+            answers[name] = solution, solved[twin].point
+        return answers
 
-    def _adjoint(self, grasps: Grasps, held: tuple, cotangents: tuple, names: frozenset) -> Grasps:
-        """The gradient of the Lagrangians with respect to the data, times cotangents of margin and directions."""
-        solution, point = held
-        scaled = self._scaled(grasps)
-        finite = jnp.isfinite(solution.directions) & (solution.directions > _ACCEPTED[scaled.scale.dtype.name] * scaled.scale[: solution.directions.shape[0]])
-        finite &= ~scaled.outside
-        weight = jnp.zeros_like(solution.directions)
-        worst = jnp.argmin(solution.directions, 0)
-        if cotangents[0] is not None:
-            weight = weight + jnp.where(jnp.arange(weight.shape[0])[:, None] == worst, cotangents[0], 0)
-        if cotangents[1] is not None:
-            weight = weight + cotangents[1]
-        weight = jnp.where(finite, weight, 0)
-        if scaled.scale.shape[0] == 1:
-            weight = fold(jnp.add, weight)[None]
-        elif scaled.free:
-            weight = jnp.concatenate([weight, jnp.zeros_like(weight[:1])])
-        weight = weight * scaled.scale
-        point = jax.tree.map(lambda x: jnp.where(weight != 0, x, 0), point)
+    def _adjoint(self, grasps: Grasps, held: dict, cotangents: dict, names: frozenset) -> Grasps:
+        """The gradient of the Lagrangians with respect to the data, times cotangents of margins and directions."""
+        _, scaled = self._scaled(grasps)
+        weights, points = {}, {}
+        for name, (solution, point) in held.items():
+            weight = _program_weights(solution, cotangents[name], scaled[self._twin(name)], FORMULATIONS[name])
+            weights[name] = weight
+            points[name] = jax.tree.map(lambda x, weight=weight: jnp.where(weight != 0, x, 0), point)
 
         def value(grasps: Grasps) -> jax.Array:
-            return -jnp.sum(weight * self._scaled(grasps).problem.lagrangian(point))
+            _, scaled = self._scaled(grasps)
+            lagrangian = lambda name: scaled[self._twin(name)].problem.lagrangian(points[name])  # noqa: E731
+            return -fold(jnp.add, [jnp.sum(weights[name] * lagrangian(name)) for name in held])
 
         return jax.grad(value, allow_int=True)(grasps)
 
 
+def _program_weights(solution: FormulationSolution, cotangents: tuple, scaled: Scaled, form: Formulation) -> jax.Array:
+    """What cotangents of margin and directions ask of the optima of the programs, (D, *lanes)."""
+    directions, scale = solution.directions, scaled.scale
+    given = jnp.zeros_like(directions)
+    if cotangents[0] is not None:
+        binds = jnp.arange(given.shape[0])[:, None] == jnp.argmin(directions, 0)
+        given = given + jnp.where(binds, cotangents[0], 0)
+    if cotangents[1] is not None:
+        given = given + cotangents[1]
+    # What is zero is flat, or zero by definition.
+    least = _ACCEPTED[scale.dtype.name] * (scale if scale.shape[0] == 1 else scale[: given.shape[0]])
+    given = jnp.where(jnp.isfinite(directions) & (directions > least), given, 0)
+    if form.free:
+        given = jnp.concatenate([given, jnp.zeros_like(given[:1])])
+    elif form.shared:
+        given = fold(jnp.add, given)[None]
+    return given * scale
+
+
+def _outcome(grasps: Grasps, shared: Basics, scaled: Scaled, free: bool) -> ConicOutcome:
+    """Solve all programs of a formulation but those whose answer is known; point leaves (..., D, *lanes)."""
+    runs = jnp.broadcast_to(grasps.valid & ~shared.load_outside, scaled.scale.shape)
+    if free:
+        there = shared.disturbed & ~shared.outside
+        runs &= jnp.concatenate([there, jnp.ones_like(there[:1])])
+    return embedding.solve(scaled.problem, _TOLERANCE[scaled.scale.dtype.name], runs)
+
+
+def _answer(
+    grasps: Grasps, shared: Basics, scaled: Scaled, form: Formulation, out: ConicOutcome
+) -> FormulationSolution:
+    accepted, scale = _ACCEPTED[scaled.scale.dtype.name], scaled.scale
+    value, bound = jnp.minimum(out.point.margin, out.upper), out.upper
+    solved = (out.error <= accepted) & ~out.infeasible
+    # What is zero to the tolerance is zero.
+    value = jnp.where(solved & (jnp.abs(value) <= accepted), jnp.maximum(value, 0), value)
+    hopeless = out.infeasible | (solved & (value < 0)) | (bound < -accepted)
+    infeasible, unknown = _verdict(shared, form, solved | hopeless, hopeless)
+
+    def each_direction(values: jax.Array) -> jax.Array:
+        values = values * scale
+        own = jnp.broadcast_to(
+            values[: 1 if values.shape[0] == 1 else shared.disturbed.shape[0]], shared.disturbed.shape
+        )
+        return jnp.where(shared.outside, 0, jnp.where(shared.disturbed, own, jnp.inf))
+
+    directions, upper = each_direction(value), each_direction(bound)
+    undisturbed = ~shared.disturbed.any(0)
+    status = jnp.select(
+        [~grasps.valid, shared.load_outside | infeasible, unknown, undisturbed],
+        [Status.INVALID_INPUT, Status.INFEASIBLE, Status.MAX_ITERATIONS, Status.UNBOUNDED],
+        Status.SOLVED,
+    ).astype(jnp.int32)
+    answered = (status == Status.SOLVED) | (status == Status.UNBOUNDED)
+    hide = lambda v: jnp.where(answered, v, jnp.nan)  # noqa: E731
+    margin, worst = jnp.min(directions, 0), jnp.argmin(directions, 0)
+    upper = jnp.maximum(jnp.min(upper, 0), margin)
+    program = worst if scale.shape[0] > 1 else jnp.zeros_like(worst)
+    forces, disturbed = _forces(shared, form, out.point.x, directions, margin, program)
+    finite = answered & ~undisturbed & ~shared.outside.any(0)
+    direction, contact, row = _binding(scaled.problem, form, out.point.z, program)
+    told = lambda v: jnp.where(finite, v, -1).astype(jnp.int32)  # noqa: E731
+    return FormulationSolution(
+        margin=hide(margin),
+        upper_bound=hide(upper),
+        directions=hide(directions),
+        forces=hide(jnp.moveaxis(forces * grasps.present, 1, 0)),
+        disturbed_forces=hide(jnp.moveaxis(disturbed * grasps.present, 2, 1)),
+        status=status,
+        direction=told(direction),
+        contact=told(contact),
+        row=told(row),
+        iterations=jnp.max(out.iterations, 0),
+        primal_residual=hide(jnp.max(jnp.where(out.iterations > 0, out.residual, 0), 0)),
+        gap=hide(jnp.where(finite, (upper - margin) / jnp.maximum(_pick(scale, program), margin), 0)),
+    )
+
+
+def _verdict(shared: Basics, form: Formulation, known: jax.Array, hopeless: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whether there are no admissible forces, and whether that cannot be told, (*lanes)."""
+    if not form.free:
+        return hopeless.any(0), ~known.all(0)
+    there, idle = shared.disturbed & ~shared.outside, ~shared.disturbed.any(0)
+    fails, told = hopeless[:-1] & there, (known[:-1] | ~there).all(0)
+    no_rest, rest_known = hopeless[-1], known[-1]
+    if form.shared:
+        # With an f_0, each direction has forces for lambda = 0 at least.
+        return no_rest, ~rest_known | ~no_rest & (~told | fails.any(0))
+    # Of a direction that contact forces do not reach, nothing can be borne, and that by an f_0.
+    by_rest = shared.outside.any(0) | idle
+    return fails.any(0) | by_rest & no_rest, ~told | by_rest & ~rest_known
+
+
 def _forces(
-    scaled: Scaled, shared: bool, out: ConicOutcome, directions: jax.Array, margin: jax.Array, program: jax.Array
+    shared: Basics, form: Formulation, x: jax.Array, directions: jax.Array, margin: jax.Array, program: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """f_0 (3, n, *lanes) and f_0 + delta f_j at the margin (n_d, 3, n, *lanes), N."""
-    x = jnp.moveaxis(out.point.x, 2, 0) * scaled.sizes
-    if scaled.free:
-        rest = x[-1]
+    """f_0 (3, n, *lanes) and f_0 + delta f_j at the margin (n_d, 3, n, *lanes), N, of x (3, n, D, *lanes)."""
+    own = jnp.moveaxis(x, 2, 0) * shared.sizes
+    if form.free:
         # On the way from f_0 to what bears the most that this direction allows.
-        share = jnp.where(jnp.isfinite(directions) & (directions > 0), margin / jnp.where(directions > 0, directions, 1), 0)
-        return rest, rest + share[:, None, None] * (x[:-1] - rest)
-    reach = jnp.where(jnp.isfinite(margin), margin, 0)
-    disturbed = x + reach * scaled.answers
-    return _pick(x, program), disturbed
+        some = jnp.isfinite(directions) & (directions > 0)
+        share = jnp.where(some, margin / jnp.where(some, directions, 1), 0)
+        return own[-1], own[-1] + share[:, None, None] * (own[:-1] - own[-1])
+    return _pick(own, program), own + jnp.where(jnp.isfinite(margin), margin, 0) * shared.answers
 
 
 def _pick(values: jax.Array, program: jax.Array) -> jax.Array:
@@ -290,22 +324,17 @@ def _pick(values: jax.Array, program: jax.Array) -> jax.Array:
 
 
 def _binding(
-    scaled: Scaled, point: ConicPoint, program: jax.Array, finite: jax.Array
+    problem: ConicMargin, form: Formulation, z: tuple[jax.Array, ...], program: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Direction, contact and row of the largest multiplier of the program that binds; -1 where there is none."""
-    rows = []
-    for part, z in zip(scaled.problem.rows, point.z, strict=True):
-        # (d, J, n, *lanes): of a second-order cone the head is the size of the whole.
-        own = _pick(jnp.moveaxis(z, 3, 0), program)
-        rows.append(own[:1] if part.second_order else own)
-    z = jnp.concatenate(rows)
-    count, copies, n, lanes = z.shape
-    where = jnp.argmax(z.reshape(-1, lanes), 0)
+    """Direction, contact and row of the largest multiplier of the program that binds; direction -1 for rest."""
+    # (d, J, n, *lanes) each; of a second-order cone the head is the size of the whole.
+    own = [_pick(jnp.moveaxis(z_p, 3, 0), program) for z_p in z]
+    own = [z_p[:1] if part.second_order else z_p for part, z_p in zip(problem.rows, own, strict=True)]
+    rows = jnp.concatenate(own)
+    _, copies, n, lanes = rows.shape
+    where = jnp.argmax(rows.reshape(-1, lanes), 0)
     row, copy, contact = where // (copies * n), where // n % copies, where % n
-    if scaled.free:
-        direction = program
-    else:
-        # Copies are the directions and, last, the forces at rest.
-        direction = jnp.where(copy == copies - 1, -1, program if copies == 2 and scaled.scale.shape[0] > 1 else copy)
-    hide = lambda v: jnp.where(finite, v, -1).astype(jnp.int32)  # noqa: E731
-    return hide(direction), hide(contact), hide(row)
+    if form.free:
+        return program, contact, row
+    # The last copy is rest.
+    return jnp.where(copy == copies - 1, -1, copy if form.shared else program), contact, row
