@@ -37,6 +37,7 @@ class ConicOutcome(NamedTuple):
     upper: certified: no admissible point has a larger lambda (for lambda >= 0).
     error: of `point`, the largest of its residuals and its gap, relative.
     infeasible: bool, there is a certificate that no point is admissible.
+    certificate: how far the best one is from being exact; inf where there is none at all.
     residual: how far `point` misses rows and equalities.
     iterations: steps taken.
     """
@@ -45,6 +46,7 @@ class ConicOutcome(NamedTuple):
     upper: jax.Array
     error: jax.Array
     infeasible: jax.Array
+    certificate: jax.Array
     residual: jax.Array
     iterations: jax.Array
 
@@ -111,6 +113,7 @@ def solve(problem: ConicMargin, tolerance: float, active: jax.Array) -> ConicOut
         jnp.full(lanes, jnp.inf, dtype),
         jnp.zeros(lanes, bool),
         jnp.full(lanes, jnp.inf, dtype),
+        jnp.full(lanes, jnp.inf, dtype),
         jnp.zeros(lanes, jnp.int32),
     )
 
@@ -120,7 +123,7 @@ def solve(problem: ConicMargin, tolerance: float, active: jax.Array) -> ConicOut
         state = _where(fine, stepped, carry.state)
         residuals = _residuals(problem, state)
         found = _assessed(problem, state, residuals, carry.best, tolerance)
-        better = found.error < 0.9 * carry.best.error
+        better = (found.error < 0.9 * carry.best.error) | (found.certificate < 0.9 * carry.best.certificate)
         found = found._replace(iterations=carry.best.iterations + 1)
         best = _where(carry.active, found, carry.best)
         stalled = jnp.where(better, 0, carry.stalled + 1)
@@ -151,7 +154,8 @@ def _assessed(problem: ConicMargin, state: _State, r: _Residuals, best: ConicOut
     upper = jnp.where(pull > 0, (value + radius * lost) / jnp.where(pull > 0, pull, 1), jnp.inf)
     # With nothing on the right, (y, z) excludes every x with |x|_inf <= 1, whatever lambda is.
     size = jnp.maximum(1e-30, -value)
-    infeasible = (value < 0) & (lost + jnp.abs(pull) <= tolerance * size)
+    certificate = jnp.where(value < 0, (lost + jnp.abs(pull)) / size, jnp.inf)
+    certificate = jnp.where(jnp.isfinite(certificate), jnp.minimum(best.certificate, certificate), best.certificate)
 
     better = error < best.error
     point = ConicPoint(state.x * inverse, lam, state.y * inverse, tuple(z * inverse for z in state.z))
@@ -160,7 +164,8 @@ def _assessed(problem: ConicMargin, state: _State, r: _Residuals, best: ConicOut
         error=jnp.where(better, error, best.error),
         residual=jnp.where(better, primal, best.residual),
         upper=jnp.minimum(best.upper, jnp.where(jnp.isfinite(upper), upper, jnp.inf)),
-        infeasible=best.infeasible | infeasible,
+        infeasible=certificate <= tolerance,
+        certificate=certificate,
     )
 
 
