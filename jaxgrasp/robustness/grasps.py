@@ -164,7 +164,7 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
         return _admit(raw, terms.terms, extents)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
+    compact = kernel.compact and not {"compliance", "per_vertex", "weights"} & set(arguments)
     rows = n * (kernel.rows + 1)
     if given["actuation"] is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.

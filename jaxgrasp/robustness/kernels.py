@@ -41,9 +41,11 @@ class Kernel(Protocol):
     """What is computed for every lane, and how it varies with the arguments.
 
     rows: how many rows a contact has but for the bound on its force, which sets the size of a tile.
+    compact: whether it is free of library calls and large reductions, see `map_lanes`.
     """
 
     rows: int
+    compact: bool
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
@@ -60,6 +62,7 @@ class OfPyramids:
     """A kernel with the rows of friction pyramids."""
 
     cone_edges: int
+    compact = True
 
     @property
     def rows(self) -> int:
@@ -69,6 +72,8 @@ class OfPyramids:
 
 class Plain(ABC):
     """A kernel of one stage that is its own derivative's function."""
+
+    compact = True
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
