@@ -30,7 +30,7 @@ TASK = jg.DisturbanceSet.vertices(np.concatenate([np.eye(6)[:3], [[0, 0, 0, 0, 0
 # One program for a metric and shape: tests share them.
 bound = jax.jit(metrics.ferrari_canny_bound, static_argnums=1)
 closure = jax.jit(metrics.force_closure)
-least = jax.jit(metrics.min_weight)
+least = lambda c, s: closure(c, s).min_weight  # noqa: E731
 task = jax.jit(metrics.task_wrench)
 cheap = jax.jit(
     lambda c, s: (metrics.smallest_singular_value(c, s), metrics.isotropy(c, s), metrics.closure_residual(c, s))
@@ -149,6 +149,7 @@ def test_force_closure_and_its_certificates():
     assert np.isnan(np.asarray(found.separating_twist)[wanted]).all()
 
 
+@pytest.mark.thorough
 def test_task_wrenches_are_those_of_highs():
     contacts, W = random_contacts(), edges(random_contacts())
     length = np.sqrt((np.asarray(contacts.positions) ** 2).sum(-1).mean(-1))
@@ -181,9 +182,6 @@ def test_turning_the_object_changes_nothing():
     before, after = closure(contacts, SPACE), closure(turned, SPACE)
     np.testing.assert_array_equal(before.closed, after.closed)
     np.testing.assert_allclose(before.min_weight, after.min_weight, atol=PROGRAM_TOLERANCE)
-    np.testing.assert_allclose(
-        task(contacts, TASK, SPACE), task(turned, TASK.rotated(R), SPACE), atol=PROGRAM_TOLERANCE
-    )
     for row in range(4):
         exact = [metrics.ferrari_canny(one(c, row), "L1", SPACE) for c in (contacts, turned)]
         np.testing.assert_allclose(*exact, atol=1e-9)
@@ -191,7 +189,6 @@ def test_turning_the_object_changes_nothing():
 
 def test_more_friction_never_hurts():
     contacts, more = random_contacts(), random_contacts(friction=MU + 0.1)
-    assert np.all(task(more, TASK, SPACE) >= task(contacts, TASK, SPACE) - PROGRAM_TOLERANCE)
     assert not np.any(np.asarray(closure(contacts, SPACE).closed) & ~np.asarray(closure(more, SPACE).closed))
     for row in range(8):
         less, much = (metrics.ferrari_canny(one(c, row), "L1", SPACE) for c in (contacts, more))
@@ -199,8 +196,8 @@ def test_more_friction_never_hurts():
 
 
 def batched(contacts: jg.Contacts) -> dict[str, np.ndarray]:
-    values = [least(contacts, SPACE), bound(contacts, "L1", SPACE), task(contacts, TASK, SPACE)]
-    names = ["min_weight", "bound", "task", "singular", "isotropy", "residual"]
+    values = [least(contacts, SPACE), bound(contacts, "L1", SPACE)]
+    names = ["min_weight", "bound", "singular", "isotropy", "residual"]
     return dict(zip(names, map(np.asarray, [*values, *cheap(contacts, SPACE)]), strict=True))
 
 
@@ -225,6 +222,20 @@ def test_a_bad_grasp_does_no_harm_to_others():
     assert np.isnan(metrics.wrench_space_volume(one(bad, 5), SPACE))
 
 
+@pytest.mark.thorough
+def test_task_wrenches_turn_with_the_object_grow_with_friction_and_keep_to_themselves():
+    contacts = random_contacts()
+    before = np.asarray(task(contacts, TASK, SPACE))
+    R = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    R *= np.linalg.det(R)
+    turned = replace(contacts, positions=contacts.positions @ R.T, frames=R @ contacts.frames)
+    np.testing.assert_allclose(before, task(turned, TASK.rotated(R), SPACE), atol=PROGRAM_TOLERANCE)
+    assert np.all(task(random_contacts(friction=MU + 0.1), TASK, SPACE) >= before - PROGRAM_TOLERANCE)
+    bad = np.asarray(task(replace(contacts, frames=contacts.frames.at[5].set(0.0)), TASK, SPACE))
+    assert np.isnan(bad[5])
+    np.testing.assert_array_equal(np.delete(bad, 5), np.delete(before, 5))
+
+
 def test_absent_contacts_count_as_never_there():
     contacts = random_contacts()
     rubbish = jnp.full((COUNT, 1, 3), jnp.nan)
@@ -238,25 +249,24 @@ def test_absent_contacts_count_as_never_there():
     for mine, other in zip(cheap(contacts, SPACE), cheap(padded, SPACE), strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-12)
     for row in range(2):
-        for norm in ("L1", "Linf"):
-            exact = [metrics.ferrari_canny(one(c, row), norm, SPACE) for c in (contacts, padded)]
-            np.testing.assert_allclose(*exact, atol=1e-12)
+        exact = [metrics.ferrari_canny(one(c, row), "L1", SPACE) for c in (contacts, padded)]
+        np.testing.assert_allclose(*exact, atol=1e-12)
 
 
 def test_few_contacts_get_answers():
-    contacts = jg.Contacts.from_normals(
-        [[[0.03, 0.01, 0.0], [-0.03, 0.0, 0.0]], [[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]]],
-        [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]],
-        friction=0.5,
-        max_force=1.0,
-        active=[[True, False], [True, True]],
-    )
-    found = closure(contacts, SPACE)
-    assert not found.closed.any() and np.all(np.asarray(found.status) == jg.Status.SOLVED)
+    """One contact; two opposite ones; in grasps that have room for four."""
+    positions, normals = np.zeros((COUNT, 4, 3)), np.tile([1.0, 0.0, 0.0], (COUNT, 4, 1))
+    positions[:, :2] = [[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]]
+    normals[:, 1] *= -1
+    active = np.tile([True, True, False, False], (COUNT, 1))
+    active[0, 1], positions[0, 0, 1] = False, 0.01
+    contacts = jg.Contacts.from_normals(positions, normals, friction=0.5, max_force=1.0, active=active)
+    found = jax.tree.map(lambda x: np.asarray(x)[:2], closure(contacts, SPACE))
+    assert not found.closed.any() and np.all(found.status == jg.Status.SOLVED)
     # Two opposite contacts cancel, but leave the rotation about their line.
     np.testing.assert_array_equal(found.min_weight > 0, [False, True])
-    raw = metrics.edge_wrenches(contacts, WrenchSpace(cone_edges=EDGES, length=1.0))
-    twist = np.asarray(found.separating_twist)
+    raw = metrics.edge_wrenches(contacts, WrenchSpace(cone_edges=EDGES, length=1.0))[:2]
+    twist = found.separating_twist
     assert np.all(np.einsum("bcei,bi->bce", raw, twist) < 1e-9) and np.all(np.abs(twist).max(-1) > 0.1)
     assert np.all(np.asarray(cheap(contacts, SPACE)[0]) < 1e-9)
     for row in range(2):
@@ -270,7 +280,7 @@ DIFFERENTIABLE = {
     "singular": lambda c: cheap(c, SPACE)[0],
     "isotropy": lambda c: cheap(c, SPACE)[1],
     "residual": lambda c: cheap(c, SPACE)[2],
-    "min_weight": lambda c: least(c, SPACE),
+    "min_weight": lambda c: metrics.min_weight(c, SPACE),
     "task": lambda c: task(c, TASK, SPACE),
 }
 
@@ -282,7 +292,7 @@ DIFFERENTIABLE = {
         "singular",
         "isotropy",
         "residual",
-        "min_weight",
+        pytest.param("min_weight", marks=pytest.mark.thorough),
         pytest.param("task", marks=pytest.mark.thorough),
         pytest.param("bound Linf", marks=pytest.mark.thorough),
     ],
@@ -305,11 +315,9 @@ def test_derivatives_are_central_differences(name):
 def test_any_batch_axes():
     contacts = random_contacts()
     shaped = jax.tree.map(lambda x: x.reshape(4, 1, 6, *x.shape[1:]), contacts)
-    for whole, parts in zip(cheap(contacts, SPACE), cheap(shaped, SPACE), strict=True):
-        assert parts.shape == (4, 1, 6)
-        np.testing.assert_allclose(np.ravel(parts), whole, atol=1e-12)
-    mapped = jax.vmap(lambda c: metrics.closure_residual(c, SPACE))(contacts)
-    np.testing.assert_allclose(mapped, cheap(contacts, SPACE)[2], atol=1e-12)
+    whole = cheap(contacts, SPACE)[2]
+    np.testing.assert_allclose(metrics.closure_residual(shaped, SPACE).ravel(), whole, atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(lambda c: metrics.closure_residual(c, SPACE))(contacts), whole, atol=1e-12)
 
 
 @pytest.mark.thorough
@@ -349,26 +357,35 @@ def test_every_metric_is_in_the_table():
     assert {name for name, metric in METRICS.items() if metric.name != name} == set()
     setting = Setting(disturbances=TASK, cone_edges=EDGES, task={})
     contacts = one(random_contacts(), 0)
-    for name in ("ferrari_canny", "ferrari_canny_linf", "volume", "isotropy", "closure_residual"):
+    for name in ("ferrari_canny", "volume", "closure_residual"):
         assert np.isfinite(METRICS[name].value(contacts, setting)), name
     assert [name for name, metric in METRICS.items() if not metric.larger_is_better] == ["closure_residual"]
 
 
 @pytest.mark.skipif(not YCB.exists(), reason="the collection of real grasps is not here")
-def test_stored_figures_of_real_grasps():
+def test_stored_balls_of_real_grasps():
+    given, contacts, space = frogger()
+    stored = given["ferrari_canny"][::5]
+    rows = range(0, len(contacts.positions), 5)
+    radii = [
+        metrics.ferrari_canny(one(contacts, row), "L1", replace(space, reference=space.reference[row])) for row in rows
+    ]
+    assert np.mean(np.abs(radii - stored) <= 0.01 * stored) >= 0.9
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(not YCB.exists(), reason="the collection of real grasps is not here")
+def test_stored_min_weights_of_real_grasps():
+    given, contacts, space = frogger()
+    stored = given["min_weight"]
+    weights = np.asarray(jax.jit(metrics.min_weight)(contacts, space))
+    assert np.mean(np.abs(weights - stored) <= 0.01 * np.abs(stored)) >= 0.9
+
+
+def frogger() -> tuple[dict[str, np.ndarray], jg.Contacts, WrenchSpace]:
+    """The collection in its own conventions: the first tangent is (1.2, 2.3, 3.4) made orthogonal to the normal."""
     with np.load(YCB, allow_pickle=False) as data:
         given = {name: data[name] for name in data}
-    contacts, space = frogger(given)
-    stored, weights = given["min_weight"], np.asarray(jax.jit(metrics.min_weight)(contacts, space))
-    assert np.mean(np.abs(weights - stored) <= 0.01 * np.abs(stored)) >= 0.9
-    stored, radii = given["ferrari_canny"], []
-    for row in range(0, len(stored), 5):
-        radii.append(metrics.ferrari_canny(one(contacts, row), "L1", one_space(space, row)))
-    assert np.mean(np.abs(radii - stored[::5]) <= 0.01 * stored[::5]) >= 0.9
-
-
-def frogger(given: dict[str, np.ndarray]) -> tuple[jg.Contacts, WrenchSpace]:
-    """The collection's conventions: the first tangent is (1.2, 2.3, 3.4) made orthogonal to the normal."""
     n = given["outward_normals"]
     seed = np.array([1.2, 2.3, 3.4])
     t1 = seed - n * (n @ seed)[..., None]
@@ -376,11 +393,8 @@ def frogger(given: dict[str, np.ndarray]) -> tuple[jg.Contacts, WrenchSpace]:
     frames = np.stack([t1, np.cross(n, t1), n], -1)
     friction = np.repeat(given["friction"][:, None], n.shape[1], 1)
     contacts = jg.Contacts.from_frames(given["positions"], frames, friction=friction, max_force=1.0)
-    return contacts, WrenchSpace(cone_edges=4, unit_edges=True, length=1.0, reference=-given["center_of_mass"])
-
-
-def one_space(space: WrenchSpace, row: int) -> WrenchSpace:
-    return replace(space, reference=space.reference[row])
+    space = WrenchSpace(cone_edges=4, unit_edges=True, length=1.0, reference=-given["center_of_mass"])
+    return given, contacts, space
 
 
 @pytest.mark.thorough

@@ -16,6 +16,7 @@ from jaxgrasp.metrics.matrices import closure_residual, isotropy, smallest_singu
 from jaxgrasp.metrics.task import task_wrench
 from jaxgrasp.metrics.wrench_space import WrenchSpace
 from jaxgrasp.robustness import largest_disturbance
+from jaxgrasp.robustness.formulations import formulation_margin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +55,18 @@ def _margin(contacts: Contacts, setting: Setting) -> jax.Array:
     return found.margin
 
 
+def _margin_of(formulation: str) -> Callable[[Contacts, Setting], jax.Array]:
+    # These programs have rows of contacts alone: what actuators cannot do is not asked.
+    def value(contacts: Contacts, setting: Setting) -> jax.Array:
+        load = setting.task.get("required_wrench")
+        found = formulation_margin(
+            contacts, setting.disturbances, formulation, required_wrench=load, cone_edges=setting.cone_edges
+        )
+        return found.margin
+
+    return value
+
+
 def _closed(contacts: Contacts, setting: Setting) -> jax.Array:
     found = force_closure(contacts, setting.space)
     return jnp.where(jnp.isnan(found.min_weight), jnp.nan, found.closed)
@@ -63,6 +76,20 @@ METRICS = {
     metric.name: metric
     for metric in (
         Metric(name="margin", about="robustness margin (21)", value=_margin),
+        Metric(name="margin_12", about="largest disturbance by (12)", value=_margin_of("12")),
+        Metric(name="margin_12_fixed", about="by (12) with blocking forces", value=_margin_of("12_fixed")),
+        Metric(name="margin_13", about="by (13)", value=_margin_of("13")),
+        Metric(name="margin_16", about="by (16)", value=_margin_of("16")),
+        Metric(
+            name="margin_per_direction",
+            about="the smallest over the directions, each with forces of its own",
+            value=_margin_of("per_direction"),
+        ),
+        Metric(
+            name="margin_per_direction_prestrained",
+            about="the same with blocking forces",
+            value=_margin_of("per_direction_prestrained"),
+        ),
         Metric(
             name="ferrari_canny",
             about="largest ball in the wrench space, sum of normal forces 1 (hull)",
