@@ -34,7 +34,7 @@ MAX_FORCE = 5.0
 RESAMPLES = 4000
 # Compared with the picks; what cannot be asked for so many points is left to its bound.
 COMPARED = [name for name in METRICS if name not in ("ferrari_canny_bound", "ferrari_canny_linf")]
-BATCH, LOOPED = 4096, 64
+BATCH, LOOPED = 1024, 64
 NEAR = 0.01
 
 
