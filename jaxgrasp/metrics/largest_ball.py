@@ -95,7 +95,7 @@ def _farthest(W: jax.Array) -> tuple[jax.Array, jax.Array]:
     middle = jnp.full(groups, 1 / (groups + 1), dtype)
 
     def walk(n: jax.Array, t: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
-        return lax.fori_loop(0, steps, lambda _, at: _step(W, *at, at[0])[:2], (n, t))
+        return lax.fori_loop(0, steps, lambda _, at: _step(W, at[0], at[1], at[0])[:2], (n, t))
 
     def from_start(direction: jax.Array) -> tuple[jax.Array, jax.Array]:
         n, t, _ = _step(W, jnp.zeros(6, dtype), middle, direction)

@@ -25,7 +25,7 @@ def figure_of_comparison(comparison: Comparison, *, outcome: str = "success") ->
         _draw_correlation(figure.subplots(), comparison)
         return figure
     figure = Figure(figsize=(2 * side + 2.5, side), layout="constrained", dpi=150)
-    matrix, right = figure.subfigures(1, 2, width_ratios=(side, side + 2.5))
+    matrix, right = figure.subfigures(1, 2, width_ratios=(side, side + 2.5), squeeze=False).flat
     _draw_correlation(matrix.subplots(), comparison)
     curves, areas = right.subplots(1, 2, width_ratios=(1.25, 1))
     colours = colormaps["tab20"](np.arange(count) % 20)
