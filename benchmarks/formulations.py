@@ -1,7 +1,7 @@
 """What each approximation of the paper's chain costs, and how fast its programs are.
 
-`python -m benchmarks.formulations` writes formulations.md and formulations.png beside this file. formulations.json keeps
-what was measured; `--parts accuracy,costs,edges,speed` measures some of it anew. The recorded grasps are taken where
+`python -m benchmarks.formulations` writes formulations.md and formulations.png beside this file. formulations.json
+keeps what was measured; `--parts accuracy,costs,edges,speed` measures some of it anew. The recorded grasps are taken where
 they are present.
 """
 
@@ -221,9 +221,8 @@ def text(found: dict) -> str:
             "## Against HiGHS and Clarabel",
             "",
             "Whole programs: (12) and (13) with the forces of all directions, (16) with the rows of all. Random grasps",
-            "without and with load, some of them on one side, with a contact twice or with all contacts in line, and the",
-            "recorded ones.",
-            "Errors are of max(margin, natural scale), of (11) of max(effort, f_max^2 / 1000). (12) has the bound of (8).",
+            "without and with load, some on one side, with a contact twice or with all contacts in line, and the recorded",
+            "ones. Errors are of max(margin, natural scale), of (11) of max(effort, f_max^2 / 1000). (12) has (8)'s bound.",
             "`decided` is solved or proved infeasible; `judged` where the other solver has an answer, too.",
             "",
             "| formulation | grasps | decided | solved | judged | feasibility otherwise | worst error | worst family |",
@@ -258,8 +257,8 @@ def text(found: dict) -> str:
             "## Pyramids tend to cones",
             "",
             f"Shortfall of the margin, median / 95th percentile / most, of {e['counted']} random grasps with four",
-            f"contacts. From eight edges on the medians fall with the edges to the power {-e['free rate']:.2f} (answers free)",
-            f"and {-e['fixed rate']:.2f} (blocking forces).",
+            f"contacts. From eight edges on the medians fall with the edges to the power "
+            f"{-e['free rate']:.2f} (answers free) and {-e['fixed rate']:.2f} (blocking forces).",
             "",
             "| edges | (13) for (12) | (16) for (12), fixed answers |",
             "|---|---|---|",
@@ -274,9 +273,9 @@ def text(found: dict) -> str:
             "## Grasps a second",
             "",
             f"{s['grasps']} random grasps, four contacts, six directions, eight edges, no load; warm, by turns,",
-            f"best of {ROUNDS}. The peers have their programs ready made, one a direction where the answers are free, and",
-            "tolerance 1e-6; ours makes them from contacts, to 1e-9, with bounds. In brackets: share solved, and how far from",
-            "ours at most, of max(1, margin).",
+            f"best of {ROUNDS}. The peers have their programs ready made, one a direction where answers are free, and",
+            "tolerance 1e-6; ours makes them from contacts, to 1e-9, with bounds. In brackets: share solved, and how far",
+            "from ours at most, of max(1, margin).",
             "",
             "| formulation | jaxgrasp | best peer | times | all peers |",
             "|---|---|---|---|---|",
