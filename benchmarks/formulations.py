@@ -1,8 +1,8 @@
 """What each approximation of the paper's chain costs, and how fast its programs are.
 
 `python -m benchmarks.formulations` writes formulations.md and formulations.png beside this file. formulations.json
-keeps what was measured; `--parts accuracy,costs,edges,speed` measures some of it anew. The recorded grasps are taken where
-they are present.
+keeps what was measured; `--parts accuracy,costs,edges,speed` measures some of it anew. The recorded grasps are taken
+where they are present.
 """
 
 from __future__ import annotations
@@ -221,8 +221,9 @@ def text(found: dict) -> str:
             "## Against HiGHS and Clarabel",
             "",
             "Whole programs: (12) and (13) with the forces of all directions, (16) with the rows of all. Random grasps",
-            "without and with load, some on one side, with a contact twice or with all contacts in line, and the recorded",
-            "ones. Errors are of max(margin, natural scale), of (11) of max(effort, f_max^2 / 1000). (12) has (8)'s bound.",
+            "without and with load, some on one side, with a contact twice or with all contacts in line, and the",
+            "recorded ones. Errors are of max(margin, natural scale), of (11) of max(effort, f_max^2 / 1000). (12) has",
+            "the bound of (8).",
             "`decided` is solved or proved infeasible; `judged` where the other solver has an answer, too.",
             "",
             "| formulation | grasps | decided | solved | judged | feasibility otherwise | worst error | worst family |",
@@ -273,8 +274,8 @@ def text(found: dict) -> str:
             "## Grasps a second",
             "",
             f"{s['grasps']} random grasps, four contacts, six directions, eight edges, no load; warm, by turns,",
-            f"best of {ROUNDS}. The peers have their programs ready made, one a direction where answers are free, and",
-            "tolerance 1e-6; ours makes them from contacts, to 1e-9, with bounds. In brackets: share solved, and how far",
+            f"best of {ROUNDS}. Peers have their programs ready made, one a direction where answers are free, and",
+            "tolerance 1e-6; ours makes them from contacts, to 1e-9, with bounds. In brackets: share solved, how far",
             "from ours at most, of max(1, margin).",
             "",
             "| formulation | jaxgrasp | best peer | times | all peers |",
