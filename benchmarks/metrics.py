@@ -26,7 +26,7 @@ import jaxgrasp as jg  # noqa: E402
 from jaxgrasp import metrics  # noqa: E402
 from jaxgrasp.candidates import Candidates, read_candidates, sample_grasps  # noqa: E402
 from jaxgrasp.metrics import METRICS, Setting, WrenchSpace  # noqa: E402
-from jaxgrasp.ranking import Comparison, compare, score  # noqa: E402
+from jaxgrasp.ranking import MetricComparison, compare_metrics, score  # noqa: E402
 from jaxgrasp.viewer import figure_of_comparison, write_figure  # noqa: E402
 
 REAL = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "ycb_allegro_grasps.npz"
@@ -89,7 +89,7 @@ def stored_figures(given: dict[str, np.ndarray]) -> dict:
     }
 
 
-def predictions(candidates: Candidates) -> tuple[Comparison, Comparison]:
+def predictions(candidates: Candidates) -> tuple[MetricComparison, MetricComparison]:
     """All metrics against the picks, over all pairs of grasps and over those on the same object."""
     forces = jg.DisturbanceSet.forces(1.0)
     values = {}
@@ -102,7 +102,7 @@ def predictions(candidates: Candidates) -> tuple[Comparison, Comparison]:
     success, objects = candidates.columns["pick_success"], candidates.columns["object_name"]
     smaller = frozenset(name for name in COMPARED if not METRICS[name].larger_is_better)
     both = [
-        compare(values, success, smaller_is_better=smaller, within=within, resamples=RESAMPLES)
+        compare_metrics(values, success, smaller_is_better=smaller, within=within, resamples=RESAMPLES)
         for within in (None, objects)
     ]
     return both[0], both[1]
@@ -187,7 +187,7 @@ def paragraph(words: str) -> list[str]:
     return textwrap.wrap(" ".join(words.split()), 120)
 
 
-def text(stored: dict, everywhere: Comparison, within: Comparison, rates: list[dict]) -> str:
+def text(stored: dict, everywhere: MetricComparison, within: MetricComparison, rates: list[dict]) -> str:
     count, both = len(stored["needed"]), stored["min_weight"] & stored["ferrari_canny"]
     needed, far = stored["needed"], ~stored["min_weight"]
     closed = stored["exact"] > 1e-6

@@ -13,7 +13,7 @@ from scipy.stats import mannwhitneyu, spearmanr
 from jaxgrasp.candidates import sample_grasps
 from jaxgrasp.cli import main
 from jaxgrasp.metrics import METRICS
-from jaxgrasp.ranking import compare
+from jaxgrasp.ranking import compare_metrics
 
 # Metrics whose programs are compiled within a second.
 CHEAP = "isotropy,closure_residual"
@@ -60,7 +60,7 @@ def scores(count: int = 60) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 def test_correlations_and_areas_are_scipys():
     values, success = scores()
-    found = compare(values, success, smaller_is_better=frozenset(["other way"]), resamples=50)
+    found = compare_metrics(values, success, smaller_is_better=frozenset(["other way"]), resamples=50)
     turned = {name: -v if name == "other way" else v for name, v in values.items()}
     np.testing.assert_allclose(found.correlation, spearmanr(np.array(list(turned.values())).T).statistic, atol=1e-12)
     for area, curve, value in zip(found.prediction.auc, found.prediction.curves, turned.values(), strict=True):
@@ -72,7 +72,7 @@ def test_correlations_and_areas_are_scipys():
 def test_areas_within_labels_count_pairs_with_the_same_label():
     values, success = scores()
     labels = np.arange(60) % 3
-    found = compare(values, success, within=labels, resamples=50)
+    found = compare_metrics(values, success, within=labels, resamples=50)
     for area, value in zip(found.prediction.auc, values.values(), strict=True):
         won = pairs = 0.0
         for i in np.flatnonzero(success):
@@ -84,7 +84,7 @@ def test_areas_within_labels_count_pairs_with_the_same_label():
 def test_intervals_cover_and_shrink():
     values, success = scores(60)
     many, outcome = scores(2000)
-    few, more = (compare(v, s, resamples=400).prediction for v, s in ((values, success), (many, outcome)))
+    few, more = (compare_metrics(v, s, resamples=400).prediction for v, s in ((values, success), (many, outcome)))
     for found in (few, more):
         assert np.all((found.interval[:, 0] <= found.auc) & (found.auc <= found.interval[:, 1]))
         np.testing.assert_allclose(found.lead[0], 0, atol=1e-12)
@@ -99,15 +99,15 @@ def test_intervals_cover_and_shrink():
 
 def test_a_grasp_without_an_answer_counts_as_the_worst():
     success = np.array([True, False, True, False])
-    with_nan = compare({"m": np.array([3.0, 1.0, np.nan, 2.0])}, success, resamples=4)
-    with_least = compare({"m": np.array([3.0, 1.0, 0.0, 2.0])}, success, resamples=4)
+    with_nan = compare_metrics({"m": np.array([3.0, 1.0, np.nan, 2.0])}, success, resamples=4)
+    with_least = compare_metrics({"m": np.array([3.0, 1.0, 0.0, 2.0])}, success, resamples=4)
     assert with_nan.prediction.auc == with_least.prediction.auc == 0.5
     assert with_nan.answered == 3
 
 
 def test_without_failures_there_is_nothing_to_predict():
     with pytest.raises(ValueError, match="no pair"):
-        compare({"m": np.arange(4.0)}, np.ones(4, bool))
+        compare_metrics({"m": np.arange(4.0)}, np.ones(4, bool))
 
 
 def test_rank_by_a_metric(here, capsys):

@@ -82,7 +82,9 @@ class Case:
         angles = np.pi * (2 * np.arange(self.edges) + 1) / self.edges
         blocks = []
         for mu in self.friction:
-            facets = np.stack([np.cos(angles), np.sin(angles), np.full(self.edges, mu * np.cos(np.pi / self.edges))], -1)
+            facets = np.stack(
+                [np.cos(angles), np.sin(angles), np.full(self.edges, mu * np.cos(np.pi / self.edges))], -1
+            )
             blocks.append(np.vstack([facets, [[0, 0, -1.0]]]))
         return sp.block_diag(blocks).toarray(), np.tile([0.0] * self.edges + [1.0], len(self.friction))
 
@@ -109,7 +111,9 @@ def rest(case: Case) -> bool:
 def _lp(A, h, B, c, lam: int) -> float:
     cost = np.zeros(A.shape[1])
     cost[lam] = -1
-    out = linprog(cost, A_ub=sp.csr_matrix(A), b_ub=h, A_eq=sp.csr_matrix(B), b_eq=c, bounds=(None, None), options=HIGHS)
+    out = linprog(
+        cost, A_ub=sp.csr_matrix(A), b_ub=h, A_eq=sp.csr_matrix(B), b_eq=c, bounds=(None, None), options=HIGHS
+    )
     return -out.fun if out.status == 0 else np.nan
 
 
@@ -307,3 +311,29 @@ def recorded() -> Batch | None:
         np.tile(np.vstack([np.eye(6)[:3], -np.eye(6)[:3]]), (2 * count, 1, 1)),
         load,
     )
+
+
+def least_total_effort(case: Case, margin: float) -> float:
+    """(11) with Q = Q_0 = I, N^2; inf where infeasible, nan where Clarabel fails."""
+    (A, h), size, count = case.rows, case.G.shape[1], len(case.W)
+    weights = np.repeat(case.max_force, 3) ** 2
+    # Unknowns f_0, then the changes.
+    rows = sp.vstack(
+        [
+            sp.hstack([A, sp.csr_matrix((len(A), count * size))]),
+            sp.hstack([sp.vstack([sp.csr_matrix(A)] * count), sp.block_diag([A] * count)]),
+        ]
+    )
+    equal = sp.block_diag([case.G] * (count + 1)).tocsr()
+    sides = np.concatenate([case.b, *(-margin / case.scale * case.W)])
+    scale = weights.max()
+    status, _, value = _clarabel(
+        sp.diags(np.tile(weights / scale, count + 1)),
+        np.zeros((count + 1) * size),
+        [("l", rows, np.tile(h, count + 1))],
+        equal,
+        sides,
+    )
+    if status in ("Solved", "AlmostSolved"):
+        return value * scale
+    return np.inf if "Infeasible" in status else np.nan

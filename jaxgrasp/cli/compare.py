@@ -15,7 +15,7 @@ from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbanc
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
-    from jaxgrasp.ranking import Comparison
+    from jaxgrasp.ranking import MetricComparison
 
 DEFAULT = (
     "margin",
@@ -100,7 +100,7 @@ class Compare:
         from jaxgrasp.candidates import CandidateError, read_candidates
         from jaxgrasp.cli.report import print_comparison
         from jaxgrasp.metrics import METRICS
-        from jaxgrasp.ranking import compare
+        from jaxgrasp.ranking import compare_metrics
         from jaxgrasp.viewer import figure_of_comparison, write_figure
 
         try:
@@ -117,7 +117,7 @@ class Compare:
         values |= {f"{name} (file)" if name in METRICS else name: value for name, value in stored.items()}
         smaller = frozenset(name for name in names if not METRICS[name].larger_is_better)
         try:
-            found = compare(
+            found = compare_metrics(
                 values, success, smaller_is_better=smaller, within=within, resamples=self.resamples, seed=self.seed
             )
         except ValueError as error:
@@ -173,7 +173,7 @@ class Compare:
         return column
 
 
-def _write_table(found: "Comparison", path: Path) -> None:
+def _write_table(found: "MetricComparison", path: Path) -> None:
     part = path.with_name(path.name + ".part")
     prediction = found.prediction
     areas = ["auc", "auc_low", "auc_high", "first_minus_this", "difference_low", "difference_high"]

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxgrasp.ranking import Comparison, Ranking
+from jaxgrasp.ranking import MetricComparison, Ranking
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.synthesis import Record, Synthesis
 
@@ -156,7 +156,7 @@ def print_ranking(ranking: Ranking, unit: str, clock: Clock, written: Sequence[P
         console.print("written: " + ", ".join(map(str, written)), markup=False)
 
 
-def print_comparison(found: Comparison, outcome: str, count: int, written: Sequence[Path]) -> None:
+def print_comparison(found: MetricComparison, outcome: str, count: int, written: Sequence[Path]) -> None:
     """Prints a comparison of metrics to standard output.
 
     Args:

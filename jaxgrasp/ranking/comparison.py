@@ -30,7 +30,7 @@ class Prediction:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class MetricComparison:
     """M metrics on N grasps."""
 
     names: tuple[str, ...]
@@ -46,7 +46,7 @@ class Comparison:
     """None where nobody knows what became of the grasps."""
 
 
-def compare(
+def compare_metrics(
     metrics: Mapping[str, Float[np.ndarray, " batch"]],
     success: Bool[np.ndarray, " batch"] | None = None,
     *,
@@ -54,7 +54,7 @@ def compare(
     within: np.ndarray | None = None,
     resamples: int = 1000,
     seed: int = 0,
-) -> Comparison:
+) -> MetricComparison:
     """Compares metrics of the same grasps by rank alone.
 
     A grasp for which a metric has no answer (NaN) counts as worse than all others.
@@ -83,7 +83,7 @@ def compare(
     size = np.sqrt((ranks**2).sum(1))
     with np.errstate(invalid="ignore"):
         correlation = (ranks @ ranks.T) / np.outer(size, size)
-    return Comparison(
+    return MetricComparison(
         names=tuple(metrics),
         answered=np.array([np.sum(~np.isnan(value)) for value in turned]),
         correlation=correlation,

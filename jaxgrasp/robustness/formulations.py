@@ -30,7 +30,7 @@ from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.status import Status
 
 _TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
-# Residuals and gaps that did not close to the tolerance still count as solved below this, and bounds below zero as zero.
+# Residuals and gaps that did not close to the tolerance still count as solved below this; less than this is zero.
 _ACCEPTED = {"float64": 1e-7, "float32": 3e-4}
 
 
@@ -186,11 +186,11 @@ class Chain:
         return next(o for o in self.names if FORMULATIONS[o][:2] == form[:2] and (form.free or o == name))
 
     def _solve(self, grasps: Grasps, shared: Basics, scaled: dict[str, Scaled]) -> dict:
-        solved = {name: _outcome(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
+        solved = {name: outcome(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
         answers = {}
         for name in self.names:
             twin = self._twin(name)
-            solution = _answer(grasps, shared, scaled[twin], FORMULATIONS[name], solved[twin])
+            solution = formulation_answer(grasps, shared, scaled[twin], FORMULATIONS[name], solved[twin])
             answers[name] = solution, solved[twin].point
         return answers
 
@@ -230,7 +230,7 @@ def _program_weights(solution: FormulationSolution, cotangents: tuple, scaled: S
     return given * scale
 
 
-def _outcome(grasps: Grasps, shared: Basics, scaled: Scaled, free: bool) -> ConicOutcome:
+def outcome(grasps: Grasps, shared: Basics, scaled: Scaled, free: bool) -> ConicOutcome:
     """Solve all programs of a formulation but those whose answer is known; point leaves (..., D, *lanes)."""
     runs = jnp.broadcast_to(grasps.valid & ~shared.load_outside, scaled.scale.shape)
     if free:
@@ -239,9 +239,10 @@ def _outcome(grasps: Grasps, shared: Basics, scaled: Scaled, free: bool) -> Coni
     return embedding.solve(scaled.problem, _TOLERANCE[scaled.scale.dtype.name], runs)
 
 
-def _answer(
+def formulation_answer(
     grasps: Grasps, shared: Basics, scaled: Scaled, form: Formulation, out: ConicOutcome
 ) -> FormulationSolution:
+    """What the outcome of its programs says about a formulation."""
     accepted, scale = _ACCEPTED[scaled.scale.dtype.name], scaled.scale
     value, bound = jnp.minimum(out.point.margin, out.upper), out.upper
     solved = (out.error <= accepted) & ~out.infeasible

@@ -89,7 +89,7 @@ def identity_like(second_order: bool, v: jax.Array) -> jax.Array:
 
 
 def overshoot(w: Scaling, d: jax.Array) -> jax.Array:
-    """1 / the step along d that takes lambda to the boundary, <= 0 if none does; leading axis d or, for a cone each, 1."""
+    """1 / the step along d from lambda to the boundary, <= 0 if none does; leading axis d or, for a cone each, 1."""
     if w.size is None:
         return -d / w.value
     unit = w.value / w.root

@@ -144,6 +144,7 @@ def inner(a: Parts | list[jax.Array], b: Parts | list[jax.Array]) -> jax.Array:
 
 
 def most(parts: Parts | list[jax.Array]) -> jax.Array:
+    """Largest entry of parts, (*lanes)."""
     return fold(jnp.maximum, [reduce(jnp.maximum, v) for v in parts])
 
 

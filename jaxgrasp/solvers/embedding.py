@@ -1,11 +1,10 @@
 """The homogeneous self-dual embedding of a conic margin program, in lanes.
 
 One loop of predictor-corrector steps with Nesterov's and Todd's scaling finds an optimum, or a certificate that nothing
-is admissible, from a start that needs to be neither. The blocks are eliminated first, then the equalities, then lambda.
+is admissible; it starts at no admissible point. Blocks are eliminated first, then the equalities, then lambda.
 
-Source: Vandenberghe (2010), "The CVXOPT linear and quadratic cone program solvers", sections 4 and 7, in the homogeneous
-form of Andersen, Roos and Terlaky (2003), "On implementing a primal-dual interior-point method for conic quadratic
-optimization".
+Sources: Vandenberghe (2010), "The CVXOPT linear and quadratic cone program solvers", sections 4 and 7; Andersen, Roos
+and Terlaky (2003), "On implementing a primal-dual interior-point method for conic quadratic optimization".
 """
 
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from jaxgrasp.solvers import cones
 from jaxgrasp.solvers.block_kkt import inverse_root
 from jaxgrasp.solvers.cones import Scaling
 from jaxgrasp.solvers.conic_margin import ConicMargin, ConicPoint, Parts, inner, most, over_blocks, reduce
+from jaxgrasp.solvers.triples import back, cholesky, down
 
 _MAX_ITERATIONS = 60
 _PATIENCE = 6
@@ -229,7 +229,7 @@ def _step(problem: ConicMargin, state: _State, residuals: _Residuals, units: Par
 
     @fenced
     def correct(i: jax.Array, direction: _State, slack: Parts, scaled: Parts, over: jax.Array) -> tuple:
-        """What the next direction aims at: lambda \\ d_s and d_kappa; after the constants, the boundary itself."""
+        """What the next direction aims at, d_s divided by lambda and d_kappa: after the constants, the boundary."""
         first = i == 0
         centring = jnp.where(first, 0, (1 - 1 / jnp.maximum(over, 1)) ** 3)
         second = jnp.where(first, 0, 1)
@@ -268,16 +268,16 @@ def _factor(problem: ConicMargin, scalings: tuple[Scaling, ...]) -> _Factors:
     @fenced
     def blocks(scalings: tuple[Scaling, ...]) -> tuple:
         grams = [part.gram(w) for part, w in zip(problem.rows, scalings, strict=True)]
-        lower = _cholesky([fold(jnp.add, list(entries)) for entries in zip(*grams, strict=True)])
+        lower = cholesky([fold(jnp.add, list(entries)) for entries in zip(*grams, strict=True)])
         sigma = tuple(part.sigma for part in problem.rows)
         weighed = tuple(cones.weigh(w, v) for w, v in zip(scalings, sigma, strict=True))
-        return lower, _back(lower, problem.adjoint(weighed)[0])
+        return lower, back(lower, problem.adjoint(weighed)[0])
 
     lower, phi = blocks(scalings)
 
     @fenced
     def equalities(lower: list[jax.Array], phi: jax.Array) -> tuple:
-        reduced = _down(lower, jnp.moveaxis(problem.columns, 1, 0))
+        reduced = down(lower, jnp.moveaxis(problem.columns, 1, 0))
         matrix = jnp.stack(
             [over_blocks(jnp.swapaxes(reduced * reduced[:, r][:, None], 0, 1)) for r in range(len(problem.rhs))]
         )
@@ -303,9 +303,9 @@ def _newton(
     rhs_y: jax.Array,
     sides: Parts,
 ) -> tuple:
-    """(x, lambda, y, z) and the rows r = A x + sigma lambda + sides, with z = W^-2 r and
+    """Newton's system: x, lambda, y, z and the rows r = A x + sigma lambda + sides.
 
-    A'z + E'y = rhs_x, sigma'z + w'y = rhs_lam, E x + w lambda = rhs_y.
+    With z = W^-2 r: A'z + E'y = rhs_x, sigma'z + w'y = rhs_lam, E x + w lambda = rhs_y.
     """
 
     @fenced
@@ -315,13 +315,13 @@ def _newton(
 
     @fenced
     def eliminate(right: jax.Array, right_lam: jax.Array, rhs_y: jax.Array) -> tuple:
-        first = _back(factors.lower, right)
+        first = back(factors.lower, right)
         half = _times(factors.root, over_blocks(problem.columns * first) - rhs_y)
         across = _times(factors.root, factors.v)
         lam = right_lam - fold(jnp.add, fold(jnp.add, factors.phi * right)) - fold(jnp.add, across * half)
         lam = lam / jnp.maximum(factors.pivot, jnp.finfo(lam.dtype).tiny)
         y = fold(jnp.add, factors.root * (half + across * lam)[:, None])
-        x = first - factors.phi * lam - _back(factors.lower, problem.pull_back(y))
+        x = first - factors.phi * lam - back(factors.lower, problem.pull_back(y))
         return x, lam, y
 
     @fenced
@@ -347,35 +347,6 @@ def _newton(
     start = nothing, (*without_sides(rhs_x, rhs_lam, sides), rhs_y), none, none, sides
     (x, lam, y), _, lhs, z, _ = repeat(1 + _REFINEMENTS, improve, start)
     return x, lam, y, z, lhs
-
-
-def _cholesky(entries: list[jax.Array]) -> list[jax.Array]:
-    """1/L00, L10, 1/L11, L20, L21, 1/L22 of a 3x3 matrix given by 00, 10, 11, 20, 21, 22; pivots are clamped."""
-    a00, a10, a11, a20, a21, a22 = entries
-    eps = jnp.finfo(a00.dtype).eps
-    pivot = lambda value, diagonal: lax.rsqrt(jnp.maximum(value, eps * diagonal))  # noqa: E731
-    i0 = pivot(a00, a00)
-    l10, l20 = a10 * i0, a20 * i0
-    i1 = pivot(a11 - l10 * l10, a11)
-    l21 = (a21 - l20 * l10) * i1
-    return [i0, l10, i1, l20, l21, pivot(a22 - l20 * l20 - l21 * l21, a22)]
-
-
-def _down(lower: list[jax.Array], rhs: jax.Array) -> jax.Array:
-    """L^-1 rhs, (3, ..., n, *lanes)."""
-    i0, l10, i1, l20, l21, i2 = lower
-    a = rhs[0] * i0
-    b = (rhs[1] - l10 * a) * i1
-    return jnp.stack([a, b, (rhs[2] - l20 * a - l21 * b) * i2])
-
-
-def _back(lower: list[jax.Array], rhs: jax.Array) -> jax.Array:
-    """(L L')^-1 rhs, (3, n, *lanes)."""
-    i0, l10, i1, l20, l21, i2 = lower
-    a, b, c = _down(lower, rhs)
-    c = c * i2
-    b = (b - l21 * c) * i1
-    return jnp.stack([(a - l10 * b - l20 * c) * i0, b, c])
 
 
 def _times(matrix: jax.Array, v: jax.Array) -> jax.Array:

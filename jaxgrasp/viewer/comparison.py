@@ -5,10 +5,10 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxgrasp.ranking import Comparison
+from jaxgrasp.ranking import MetricComparison
 
 
-def figure_of_comparison(comparison: Comparison, *, outcome: str = "success") -> Figure:
+def figure_of_comparison(comparison: MetricComparison, *, outcome: str = "success") -> Figure:
     """Draws the matrix of rank correlations, ROC curves, and areas under them with their intervals.
 
     Args:
@@ -50,7 +50,7 @@ def figure_of_comparison(comparison: Comparison, *, outcome: str = "success") ->
     return figure
 
 
-def _draw_correlation(axes: Axes, comparison: Comparison) -> None:
+def _draw_correlation(axes: Axes, comparison: MetricComparison) -> None:
     count = len(comparison.names)
     axes.imshow(comparison.correlation, cmap="RdBu", vmin=-1, vmax=1)
     for row, column in np.ndindex(count, count):
