@@ -320,6 +320,20 @@ def test_any_batch_axes():
     np.testing.assert_allclose(jax.vmap(lambda c: metrics.closure_residual(c, SPACE))(contacts), whole, atol=1e-12)
 
 
+def test_conventions_may_differ_over_a_batch():
+    """One grasp about several points and in several units, of which one is none."""
+    contacts, references = one(random_contacts(), 0), np.random.default_rng(0).normal(size=(3, 1, 3))
+    lengths = np.array([0.5, 2.0, 0.0, np.nan])
+    found = metrics.closure_residual(contacts, WrenchSpace(reference=references, length=lengths))
+    assert found.shape == (3, 4) and np.isnan(found[:, 2:]).all()
+    for row in range(3):
+        for column in range(2):
+            space = WrenchSpace(reference=references[row, 0], length=lengths[column])
+            np.testing.assert_allclose(found[row, column], metrics.closure_residual(contacts, space), atol=1e-12)
+    with pytest.raises(ValueError, match="do not broadcast"):
+        metrics.closure_residual(random_contacts(), WrenchSpace(length=np.ones(5)))
+
+
 @pytest.mark.thorough
 def test_single_precision_stays_single():
     contacts = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, random_contacts())

@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import as_float, safe_norm
+from jaxgrasp.arrays import as_float, broadcast_batch, safe_norm
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.contacts import rotations
 
@@ -92,24 +92,23 @@ def edges_of(contacts: Contacts, space: WrenchSpace | None = None) -> Edges:
 
 @jax.jit
 def _edges(contacts: Contacts, space: WrenchSpace) -> Edges:
-    batch, dtype = contacts.batch_shape, contacts.positions.dtype
-    given = as_float("reference", np.zeros(3) if space.reference is None else space.reference, (3,)).astype(dtype)
-    there = contacts.active
-    valid = ((_sound(contacts)) | ~there).all(-1) & jnp.isfinite(given).all(-1)
-    present = there & valid[..., None]
-    arms = jnp.where(present[..., None], contacts.positions - given[..., None, :], 0)
+    dtype = contacts.positions.dtype
+    about = as_float("reference", np.zeros(3) if space.reference is None else space.reference, (3,)).astype(dtype)
+    unit = as_float("length", 1.0 if space.length is None else space.length, ()).astype(dtype)
+    own = len(contacts.batch_shape)
+    batch = broadcast_batch(contacts=contacts.batch_shape, reference=about.shape[:-1], length=unit.shape)
+    contacts = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape[own:])), contacts)
+    usable = jnp.isfinite(about).all(-1) & (unit > 0) & jnp.isfinite(unit)
+    valid = (_sound(contacts) | ~contacts.active).all(-1) & usable
+    present = contacts.active & valid[..., None]
+    arms = jnp.where(present[..., None], contacts.positions - about[..., None, :], 0)
     frames = jnp.where(present[..., None, None], contacts.frames, 0)
     friction = jnp.where(present, contacts.friction, 0)
+    length = jnp.broadcast_to(jnp.where(usable, unit, 1), batch)
     if space.length is None:
-        count = jnp.maximum(present.sum(-1), 1).astype(dtype)
+        count = jnp.maximum(present.sum(-1, dtype=dtype), 1)
         length = safe_norm(arms.reshape(*batch, -1)) / jnp.sqrt(count)
         length = jnp.where(length > 0, length, 1)
-    else:
-        length = as_float("length", space.length, ()).astype(dtype)
-        positive = (length > 0) & jnp.isfinite(length)
-        length, valid = jnp.where(positive, length, 1), valid & positive
-        present = present & valid[..., None]
-    length = jnp.broadcast_to(length, valid.shape)
     moments = jnp.cross(arms[..., None, :], jnp.swapaxes(frames, -1, -2)) / length[..., None, None, None]
     blocks = jnp.concatenate([frames, jnp.swapaxes(moments, -1, -2)], -2)
     angles = 2 * math.pi * np.arange(space.cone_edges) / space.cone_edges
