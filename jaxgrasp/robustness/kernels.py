@@ -68,11 +68,7 @@ class OfPyramids:
     """A kernel with the rows of friction pyramids."""
 
     cone_edges: int
-
-    @property
-    def tile(self) -> int | None:
-        """See `Kernel`."""
-        return None
+    tile = None
 
     @property
     def rows(self) -> int:
