@@ -27,9 +27,9 @@ from jaxgrasp.robustness.comparison import STEPS  # noqa: E402
 
 HERE = Path(__file__).parent
 # n_c, n_d, grasps; the recorded ones come on top.
-SHAPES = ((2, 6, 300), (3, 12, 420), (4, 24, 240), (5, 12, 300), (6, 32, 100), (8, 64, 60))
+SHAPES = ((2, 6, 250), (4, 6, 800), (5, 24, 250), (8, 64, 110))
 TOLERANCE = 1e-6
-EDGES = (4, 6, 8, 12, 16, 24, 32, 48, 64)
+EDGES = (4, 8, 16, 32, 64)
 TIMED, ROUNDS = 512, 3
 LINEAR = ("13", "16", "per_direction", "per_direction_prestrained")
 

@@ -28,7 +28,7 @@ EFFORT_TOLERANCE = 1e-6
 GRADIENT_TOLERANCE = 1e-5
 """Of max(1, slope), on nine grasps of ten: steps are as short as margins to 1e-9 allow, and some cross a kink."""
 
-SHAPES = ((2, 6, 300), (3, 12, 420), (4, 24, 240), (5, 12, 300), (6, 32, 100), (8, 64, 60))
+SHAPES = ((2, 6, 250), (4, 6, 800), (5, 24, 250), (8, 64, 110))
 """n_c, n_d, grasps; the recorded ones, twice 295, come on top."""
 
 PYRAMIDS = ("13", "16", "per_direction", "per_direction_prestrained")

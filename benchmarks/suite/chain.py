@@ -117,13 +117,21 @@ def _lp(A, h, B, c, lam: int) -> float:
     return -out.fun if out.status == 0 else np.nan
 
 
+def _least(rows: list, h: np.ndarray, equal: list, case: Case) -> float:
+    """The least lambda of programs side by side, the last unknown of each; nan where one is infeasible."""
+    count, size = len(rows), rows[0].shape[1]
+    cost = np.tile(np.r_[np.zeros(size - 1), -1.0], count)
+    A, B = sp.block_diag(rows, format="csr"), sp.block_diag(equal, format="csr")
+    out = linprog(cost, A, np.tile(h, count), B, np.tile(case.b, count), bounds=(None, None), options=HIGHS)
+    least = np.min(out.x.reshape(count, -1)[:, -1]) if out.status == 0 else np.nan
+    return least * case.scale if not least < -1e-9 else np.nan
+
+
 def per_direction(case: Case) -> float:
     """The least over the directions of max lambda with G f = b - lambda W_j; nan where one is infeasible."""
     A, h = case.rows
-    A = np.hstack([A, np.zeros((len(A), 1))])
-    found = [_lp(A, h, np.hstack([case.G, w[:, None]]), case.b, -1) for w in case.W]
-    least = np.min(found) if np.isfinite(found).all() else np.nan
-    return least * case.scale if not least < -1e-9 else np.nan
+    rows = [np.hstack([A, np.zeros((len(A), 1))])] * len(case.W)
+    return _least(rows, h, [np.hstack([case.G, w[:, None]]) for w in case.W], case)
 
 
 def unreduced(case: Case) -> float:
@@ -151,31 +159,28 @@ def prestrained(case: Case) -> float:
     A, h = case.rows
     if case.outside:
         return 0.0 if rest(case) else np.nan
-    equal, found = np.hstack([case.G, np.zeros((6, 1))]), []
-    for a in case.answers[:-1]:
-        rows = np.vstack([np.hstack([A, (A @ one)[:, None]]) for one in (a, 0 * a)])
-        found.append(_lp(rows, np.tile(h, 2), equal, case.b, -1))
-    least = np.min(found) if np.isfinite(found).all() else np.nan
-    return least * case.scale if not least < -1e-9 else np.nan
+    both = lambda a: np.vstack([np.hstack([A, (A @ one)[:, None]]) for one in (a, 0 * a)])  # noqa: E731
+    rows = [both(a) for a in case.answers[:-1]]
+    return _least(rows, np.tile(h, 2), [np.hstack([case.G, np.zeros((6, 1))])] * len(rows), case)
 
 
-def _clarabel(P, cost, rows, equal, sides) -> tuple[str, np.ndarray, float]:
-    """Rows as (kind, A, h) with sparse A."""
-    stacked = sp.vstack([equal, *[sp.csr_matrix(A) for _, A, _ in rows]]).tocsc()
+def _clarabel(P, cost, rows, cones, equal, sides) -> tuple[str, np.ndarray, float]:
+    """Rows in the cones (kind, _, h), one after the other."""
+    stacked = sp.vstack([sp.csr_matrix(equal), sp.csr_matrix(rows)]).tocsc()
     kinds = [clarabel.ZeroConeT(equal.shape[0])]
-    for kind, _, h in rows:
+    for kind, _, h in cones:
         kinds.append(clarabel.SecondOrderConeT(len(h)) if kind == "q" else clarabel.NonnegativeConeT(len(h)))
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-9
-    right = np.concatenate([sides, *[h for *_, h in rows]])
+    right = np.concatenate([sides, *[h for *_, h in cones]])
     out = clarabel.DefaultSolver(sp.csc_matrix(P), cost, stacked, right, kinds, settings).solve()
     return str(out.status), np.array(out.x), out.obj_val
 
 
-def _by_clarabel(cost, rows, equal, sides) -> float:
+def _by_clarabel(cost, rows, cones, equal, sides) -> float:
     size = len(cost)
-    status, _, value = _clarabel(sp.csc_matrix((size, size)), cost, rows, equal, sides)
+    status, _, value = _clarabel(sp.csc_matrix((size, size)), cost, rows, cones, equal, sides)
     if status in ("Solved", "AlmostSolved"):
         return -value
     return np.nan if "Infeasible" in status else np.inf
@@ -184,17 +189,14 @@ def _by_clarabel(cost, rows, equal, sides) -> float:
 def exact(case: Case, norm_bound: bool = False) -> float:
     """(12) with free delta f_j, one second-order cone program; nan where infeasible, inf where Clarabel fails."""
     count, size = len(case.W) + 1, case.G.shape[1]
-    rows = []
-    for j in range(count):
-        before, after = sp.csr_matrix((1, j * size)), sp.csr_matrix((1, (count - 1 - j) * size + 1))
-        for kind, A, h in case.cones(norm_bound):
-            wide = [sp.vstack([side] * len(A)) for side in (before, after)]
-            rows.append((kind, sp.hstack([wide[0], A, wide[1]]), h))
+    cones = case.cones(norm_bound)
+    own = np.vstack([A for _, A, _ in cones])
+    rows = sp.hstack([sp.block_diag([own] * count), sp.csr_matrix((count * len(own), 1))])
     wrenches = np.vstack([case.W, np.zeros(6)]).reshape(-1, 1)
     equal = sp.hstack([sp.block_diag([case.G] * count), sp.csr_matrix(wrenches)])
     cost = np.zeros(count * size + 1)
     cost[-1] = -1
-    value = _by_clarabel(cost, rows, equal.tocsr(), np.tile(case.b, count))
+    value = _by_clarabel(cost, rows, cones * count, equal, np.tile(case.b, count))
     return value * case.scale if not value < -1e-7 else np.nan
 
 
@@ -202,13 +204,13 @@ def exact_fixed(case: Case, norm_bound: bool = False) -> float:
     """(12) with blocking forces."""
     if case.outside:
         return min(exact(case, norm_bound), 0.0)
-    rows = []
-    for a in case.answers:
-        for kind, A, h in case.cones(norm_bound):
-            rows.append((kind, np.hstack([A, (A @ a)[:, None]]), h))
+    cones = case.cones(norm_bound)
+    own = np.vstack([A for _, A, _ in cones])
+    rows = np.vstack([np.hstack([own, (own @ a)[:, None]]) for a in case.answers])
     cost = np.zeros(case.G.shape[1] + 1)
     cost[-1] = -1
-    value = _by_clarabel(cost, rows, sp.csr_matrix(np.hstack([case.G, np.zeros((6, 1))])), case.b)
+    equal = np.hstack([case.G, np.zeros((6, 1))])
+    value = _by_clarabel(cost, rows, cones * len(case.answers), equal, case.b)
     return value * case.scale if not value < -1e-7 else np.nan
 
 
@@ -330,7 +332,8 @@ def least_total_effort(case: Case, margin: float) -> float:
     status, _, value = _clarabel(
         sp.diags(np.tile(weights / scale, count + 1)),
         np.zeros((count + 1) * size),
-        [("l", rows, np.tile(h, count + 1))],
+        rows,
+        [("l", None, np.tile(h, count + 1))],
         equal,
         sides,
     )

@@ -12,7 +12,7 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.chain import FORMULATIONS
-from jaxgrasp.robustness.formulations import Chain, FormulationSolution, check_vertices, formulation_margin
+from jaxgrasp.robustness.formulations import Chain, FormulationSolution, check_vertices, formulation_margin, tile_of
 from jaxgrasp.robustness.grasps import over_grasps
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening import largest_disturbance
@@ -97,7 +97,7 @@ def compare_formulations(
         raise ValueError(f"force_bound: got {force_bound!r}, wanted 'normal' or 'norm'")
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
-    kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm")
+    kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", tile_of(contacts, disturbances))
     found = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench)
     own: dict[str, FormulationSolution] = {name: solution for name, (solution, _) in found.items()}
     reduced = largest_disturbance(contacts, disturbances, required_wrench, cone_edges=cone_edges)

@@ -30,6 +30,8 @@ from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.status import Status
 
 _TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
+# Contacts under all directions in a tile.
+_TILE = 1024
 # Residuals and gaps that did not close to the tolerance still count as solved below this; less than this is zero.
 _ACCEPTED = {"float64": 1e-7, "float32": 3e-4}
 
@@ -124,7 +126,7 @@ def formulation_margin(
         raise ValueError(f"force_bound: got 'norm' for {formulation!r}, wanted 'normal', since pyramids are linear")
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
-    kernel = Chain((formulation,), cone_edges, force_bound == "norm")
+    kernel = Chain((formulation,), cone_edges, force_bound == "norm", tile_of(contacts, disturbances))
     solved = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)
     return solved[formulation][0]
 
@@ -138,6 +140,15 @@ def check_vertices(disturbances: DisturbanceSet) -> None:
         )
 
 
+def tile_of(contacts: Contacts, disturbances: DisturbanceSet) -> int:
+    """How many grasps to work on at a time.
+
+    Of 32 to 1,024 with four contacts and six directions 32 were fastest, by a factor of five.
+    """
+    directions = disturbances.terms[0].wrenches.shape[-2] + 1
+    return 1 << max(3, (_TILE // (contacts.n_c * directions)).bit_length() - 1)
+
+
 @dataclass(frozen=True)
 class Chain:
     """The kernel of some formulations; its results are pairs of a solution and a scaled point, by name."""
@@ -145,7 +156,7 @@ class Chain:
     names: tuple[str, ...]
     cone_edges: int
     norm_bound: bool
-    compact = False
+    tile: int
 
     @property
     def rows(self) -> int:

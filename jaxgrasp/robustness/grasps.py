@@ -20,7 +20,7 @@ from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
-from jaxgrasp.solvers.lanes import TILE
+from jaxgrasp.solvers.lanes import LOOSE_TILE, TILE
 
 
 @jax.tree_util.register_dataclass
@@ -164,13 +164,13 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
         return _admit(raw, terms.terms, extents)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = kernel.compact and not {"compliance", "per_vertex", "weights"} & set(arguments)
+    compact = kernel.tile is None and not {"compliance", "per_vertex", "weights"} & set(arguments)
     rows = n * (kernel.rows + 1)
     if given["actuation"] is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.
         joints, actuators = given["actuation"].transmission.shape[-2:]
         rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
-    lanes = Lanes(admit, shared, rows, compact)
+    lanes = Lanes(admit, shared, rows, compact, kernel.tile or LOOSE_TILE)
     out = differentiable(kernel, lanes, arguments)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 

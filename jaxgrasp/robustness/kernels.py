@@ -29,23 +29,29 @@ class Lanes:
     shared: by name of the argument.
     rows: how many rows a lane has, which sets the size of a tile.
     compact: whether a tile can be one function, see `map_lanes`.
+    tile: lanes of a tile that cannot.
     """
 
     admit: Callable[[Raw], Any]
     shared: dict[str, bool]
     rows: int
     compact: bool
+    tile: int
 
 
 class Kernel(Protocol):
     """What is computed for every lane, and how it varies with the arguments.
 
     rows: how many rows a contact has but for the bound on its force, which sets the size of a tile.
-    compact: whether it is free of library calls and large reductions, see `map_lanes`.
+    tile: None where it is free of library calls and large reductions, else how many lanes to work on, see `map_lanes`.
     """
 
     rows: int
-    compact: bool
+
+    @property
+    def tile(self) -> int | None:
+        """See above."""
+        ...
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
@@ -62,7 +68,7 @@ class OfPyramids:
     """A kernel with the rows of friction pyramids."""
 
     cone_edges: int
-    compact = True
+    tile = None
 
     @property
     def rows(self) -> int:
@@ -73,7 +79,7 @@ class OfPyramids:
 class Plain(ABC):
     """A kernel of one stage that is its own derivative's function."""
 
-    compact = True
+    tile = None
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
@@ -160,7 +166,7 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()
 
         shared = (lanes.shared, jax.tree.map(lambda _: False, held))
         stages = (enter, *kernel.stages[1:])
-        return map_lanes(stages, (arguments, held), shared, lanes.rows, compact=lanes.compact)
+        return map_lanes(stages, (arguments, held), shared, lanes.rows, compact=lanes.compact, tile=lanes.tile)
 
     @partial(value.defjvp, symbolic_zeros=True)
     def derivative(primals: tuple, dots: tuple) -> tuple[Tree, Tree]:

@@ -13,7 +13,7 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Scaled, basics, scaled_formulation
-from jaxgrasp.robustness.formulations import FormulationSolution, check_vertices, formulation_answer, outcome
+from jaxgrasp.robustness.formulations import FormulationSolution, check_vertices, formulation_answer, outcome, tile_of
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.solvers import interior_point
@@ -93,7 +93,7 @@ def least_total_effort(
     if compliance is not None and jnp.shape(compliance)[-3:] != (contacts.n_c, 3, 3):
         raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {contacts.n_c}, 3, 3)")
     return over_grasps(
-        _TotalEffort(cone_edges),
+        _TotalEffort(cone_edges, tile_of(contacts, disturbances)),
         contacts,
         disturbances,
         required_wrench=required_wrench,
@@ -103,8 +103,9 @@ def least_total_effort(
     )[0]
 
 
+@dataclass(frozen=True)
 class _TotalEffort(OfPyramids):
-    compact = False
+    tile: int
 
     @property
     def stages(self) -> tuple:
