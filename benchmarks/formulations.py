@@ -1,7 +1,7 @@
 """What each approximation of the paper's chain costs, and how fast its programs are.
 
 `python -m benchmarks.formulations` writes formulations.md and formulations.png beside this file. formulations.json
-keeps what was measured; `--parts accuracy,costs,edges,speed` measures some of it anew. The recorded grasps are taken
+keeps what was measured; `--parts margins,edges,speed` measures some of it anew. The recorded grasps are taken
 where they are present.
 """
 
@@ -27,9 +27,9 @@ from jaxgrasp.robustness.comparison import STEPS  # noqa: E402
 
 HERE = Path(__file__).parent
 # n_c, n_d, grasps; the recorded ones come on top.
-SHAPES = ((2, 6, 250), (4, 6, 800), (5, 24, 250), (8, 64, 110))
-TOLERANCE = 1e-6
+SHAPES = ((4, 6, 1180), (8, 64, 100), (2, 6, 250))
 EDGES = (4, 8, 16, 32, 64)
+PART = 590
 TIMED, ROUNDS = 512, 3
 LINEAR = ("13", "16", "per_direction", "per_direction_prestrained")
 
@@ -38,28 +38,36 @@ def contacts_of(batch: chain.Batch) -> jg.Contacts:
     return jg.Contacts.from_frames(batch.positions, batch.frames, friction=batch.friction, max_force=batch.max_force)
 
 
-def compared(batch: chain.Batch, **options) -> jg.Comparison:
-    vertices = jg.DisturbanceSet.vertices(batch.wrenches)
-    return jax.tree.map(np.asarray, jg.compare_formulations(contacts_of(batch), vertices, batch.load, **options))
+def compared(batch: chain.Batch) -> jg.Comparison:
+    """In parts of one size, which are compiled once."""
+    parts = []
+    for start in range(0, len(batch), PART):
+        part = chain.Batch(**{f.name: getattr(batch, f.name)[start : start + PART] for f in fields(batch)})
+        vertices = jg.DisturbanceSet.vertices(part.wrenches)
+        found = jg.compare_formulations(contacts_of(part), vertices, part.load)
+        parts.append(jax.tree.map(np.asarray, found))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def families() -> dict[str, chain.Batch]:
-    found = {f"random, {c} contacts, {d} directions": chain.sample(100 * c + d, n, c, d) for c, d, n in SHAPES}
     recorded = chain.recorded()
-    return found if recorded is None else found | {"recorded, 4 contacts, 6 directions": recorded}
+    found = {} if recorded is None else {"recorded, 4 contacts, 6 directions": recorded}
+    return found | {f"random, {c} contacts, {d} directions": chain.sample(100 * c + d, n, c, d) for c, d, n in SHAPES}
 
 
-def accuracy() -> dict:
-    """Every formulation against whole programs in HiGHS and Clarabel."""
+def margins() -> dict:
+    """Every formulation against whole programs in HiGHS and Clarabel, and what is left of the margin by each step."""
     table: dict[str, dict] = {}
+    left: dict[str, dict] = {}
     for family, batch in families().items():
         found = compared(batch)
+        left[family] = cost(found, len(batch))
         cases = [batch.case(i) for i in range(len(batch))]
         units = np.array([case.scale for case in cases])
         for name, oracle in chain.ORACLES.items():
             truth = np.array([oracle(case) for case in cases])
             known, margin = ~np.isinf(truth), found.margins[name]
-            error = np.where(known & np.isfinite(truth), np.abs(margin - truth) / np.maximum(truth, units), 0)
+            error = np.where(known & np.isfinite(truth), np.abs(margin - truth) / np.fmax(truth, units), 0)
             wrong = known & (np.isnan(truth) != np.isnan(margin))
             record(table, name, family, batch, found.statuses[name], error, known, wrong)
         most = found.margins["13"]
@@ -74,7 +82,8 @@ def accuracy() -> dict:
         wrong = known & (np.isinf(truth) != np.isnan(ours))
         record(table, "11", family, batch, np.asarray(effort.status), error, known, wrong)
         say(f"  {family}: worst " + ", ".join(f"{n} {t['families'][family]:.1e}" for n, t in table.items()))
-    return table
+        keep({"accuracy": table, "costs": left})
+    return {}
 
 
 def record(table: dict, name: str, family: str, batch, status, error, known, wrong) -> None:
@@ -88,21 +97,14 @@ def record(table: dict, name: str, family: str, batch, status, error, known, wro
     own["families"][family] = float(np.nanmax(np.where(wrong, 0, error)))
 
 
-def costs() -> dict:
+def cost(found: jg.Comparison, grasps: int) -> dict:
     """Quartiles of the ratio of neighbours in the chain, over the grasps with a margin."""
-    found = {}
-    for family, batch in families().items():
-        margins = compared(batch).margins
-        some = margins["21"] > 1e-3 * np.nanmax(margins["21"])
-        ratios = {}
-        for step, (more, less) in STEPS.items():
-            ratios[step] = np.quantile(margins[less][some] / margins[more][some], [0.25, 0.5, 0.75]).tolist()
-        ratios["all of it, (21) for (12)"] = np.quantile(
-            (margins["21"] / margins["12"])[some], [0.25, 0.5, 0.75]
-        ).tolist()
-        found[family] = {"counted": int(some.sum()), "grasps": len(batch), "ratios": ratios}
-        say(f"  {family}: {ratios}")
-    return found
+    margins = found.margins
+    some = margins["21"] > 1e-3 * np.nanmax(margins["21"])
+    pairs = STEPS | {"all of it": ("12", "21")}
+    ratio = lambda more, less: np.quantile(margins[less][some] / margins[more][some], [0.25, 0.5, 0.75]).tolist()  # noqa: E731
+    ratios = {step: ratio(*pair) for step, pair in pairs.items()} if some.any() else {}
+    return {"counted": int(some.sum()), "grasps": grasps, "ratios": ratios}
 
 
 def edges() -> dict:
@@ -125,7 +127,7 @@ def edges() -> dict:
         fit = np.array(EDGES) >= 8
         found[f"{kind} rate"] = float(-np.polyfit(np.log(np.array(EDGES)[fit]), np.log(rows[fit, 0]), 1)[0])
         found["counted"] = int(some.sum())
-    return found
+    return {"edges": found}
 
 
 def speed() -> dict:
@@ -167,7 +169,7 @@ def speed() -> dict:
             "solved": float(np.isfinite(values).mean()),
             "apart": float(np.nanmax(error)),
         }
-    return {"grasps": len(batch), "load": load, "table": table}
+    return {"speed": {"grasps": len(batch), "load": load, "table": table}}
 
 
 def figure(found: dict) -> None:
@@ -196,7 +198,7 @@ def figure(found: dict) -> None:
     left.legend(fontsize=8)
     left.grid(alpha=0.3)
 
-    family = next(reversed(found["costs"]))
+    family = next(iter(found["costs"]))
     ratios = found["costs"][family]["ratios"]
     names = list(ratios)
     middle = np.array([ratios[name] for name in names])
@@ -237,7 +239,7 @@ def text(found: dict) -> str:
             )
         lines.append("")
     if "costs" in found:
-        families = found["costs"]
+        families = {family: r for family, r in found["costs"].items() if r["ratios"]}
         lines += [
             "## What each step costs",
             "",
@@ -299,21 +301,24 @@ def text(found: dict) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", default="accuracy,costs,edges,speed")
-    parts = parser.parse_args().parts.split(",")
+def keep(more: dict) -> None:
+    """Add to what was measured, and write it out."""
     kept = HERE / "formulations.json"
-    found = json.loads(kept.read_text()) if kept.exists() else {}
-    for part in parts:
-        say(part)
-        start = time.perf_counter()
-        found[part] = {"accuracy": accuracy, "costs": costs, "edges": edges, "speed": speed}[part]()
-        say(f"  {time.perf_counter() - start:.0f} s")
-        kept.write_text(json.dumps(found, indent=1) + "\n")
-        (HERE / "formulations.md").write_text(text(found))
+    found = (json.loads(kept.read_text()) if kept.exists() else {}) | more
+    kept.write_text(json.dumps(found, indent=1) + "\n")
+    (HERE / "formulations.md").write_text(text(found))
     if {"edges", "costs"} <= set(found):
         figure(found)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--parts", default="margins,edges,speed")
+    for part in parser.parse_args().parts.split(","):
+        say(part)
+        start = time.perf_counter()
+        keep({"margins": margins, "edges": edges, "speed": speed}[part]())
+        say(f"  {time.perf_counter() - start:.0f} s")
 
 
 if __name__ == "__main__":
