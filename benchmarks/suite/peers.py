@@ -63,7 +63,7 @@ def clarabel(batch: Programs) -> Solve:
     # What `update` asks for.
     settings.presolve_enable = settings.chordal_decomposition_enable = settings.input_sparse_dropzeros = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
-    values, pattern = _sparse(np.concatenate([batch.B, batch.A], 1))
+    values, pattern = sparse(np.concatenate([batch.B, batch.A], 1))
     cones = [clarabel.ZeroConeT(6), clarabel.NonnegativeConeT(len(batch.h))]
     n = len(batch.cost)
     nothing = sp.csc_matrix((n, n))
@@ -91,9 +91,9 @@ def piqp_dense(batch: Programs) -> Solve:
 
 def piqp_sparse(batch: Programs) -> Solve:
     piqp = importlib.import_module("piqp")
-    values, pattern = _sparse(batch.A)
+    values, pattern = sparse(batch.A)
     A = [sp.csc_matrix((data, pattern.indices, pattern.indptr), pattern.shape) for data in values]
-    values, pattern = _sparse(batch.B)
+    values, pattern = sparse(batch.B)
     B = [sp.csc_matrix((data, pattern.indices, pattern.indptr), pattern.shape) for data in values]
     n = len(batch.cost)
     return _piqp(piqp.SparseSolver(), sp.csc_matrix((n, n)), batch, A, B)
@@ -177,7 +177,7 @@ def _proxqp_program(batch: Programs, make):
 
 def osqp(batch: Programs) -> Solve:
     osqp = importlib.import_module("osqp")
-    values, pattern = _sparse(np.concatenate([batch.B, batch.A], 1))
+    values, pattern = sparse(np.concatenate([batch.B, batch.A], 1))
     solver = osqp.OSQP()
     n = len(batch.cost)
     upper = np.r_[np.zeros(6), batch.h]
@@ -232,7 +232,7 @@ def _qpax(batch: Programs, dtype: str, backend: str, tolerance: float) -> Solve:
     return lambda: np.asarray(call(*matrices), float)
 
 
-def _sparse(matrices: np.ndarray) -> tuple[np.ndarray, sp.csc_matrix]:
+def sparse(matrices: np.ndarray) -> tuple[np.ndarray, sp.csc_matrix]:
     """(count, nonzeros) values of matrices of one pattern in columns, and the first of them."""
     there = np.any(matrices != 0, axis=0)
     row, column = np.nonzero(there.T)[::-1]

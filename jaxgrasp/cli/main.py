@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from jaxgrasp.cli.compare import Compare
 from jaxgrasp.cli.problems import CommandError
 from jaxgrasp.cli.rank import Rank
 from jaxgrasp.cli.synthesize import Synthesize
@@ -21,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         1 where the computation itself failed.
     """
     command = tyro.extras.subcommand_cli_from_dict(
-        {"rank": Rank, "synthesize": Synthesize},
+        {"rank": Rank, "synthesize": Synthesize, "compare": Compare},
         prog="jaxgrasp",
         description="Robustness of multi-fingered grasps, in batch.",
         args=arguments,

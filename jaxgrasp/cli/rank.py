@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.problems import CommandError, check_output, write_files
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
@@ -58,6 +59,10 @@ class Rank:
     top: int = 10
     """How many of the best get tightening forces."""
 
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Other metrics to have in the table, NAME[,NAME...]; the first one ranks. A wrong name is answered with all
+    names."""
+
     output: Path | None = Path("ranking.parquet")
     """The table to write, .parquet, .csv or .npz; None for no table."""
 
@@ -76,6 +81,7 @@ class Rank:
         Raises:
             CommandError: The options or the files cannot be used.
         """
+        names = metric_names(self.metric)
         self._check()
         configure_jax()
         from jaxgrasp.candidates import CandidateError
@@ -86,7 +92,8 @@ class Rank:
             candidates = self._candidates() if hand is None else self.of_hand.candidates(hand)
         except CandidateError as error:
             raise CommandError(str(error)) from error
-        return self._rank(candidates, disturbances, unit, hand)
+        metrics = scores_of(candidates, names, disturbances, gravity=self.gravity, cone_edges=self.cone_edges)
+        return self._rank(candidates, disturbances, unit, hand, metrics)
 
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
@@ -129,7 +136,12 @@ class Rank:
         )
 
     def _rank(
-        self, candidates: "Candidates", disturbances: "DisturbanceSet", unit: str, hand: "HandObject | None"
+        self,
+        candidates: "Candidates",
+        disturbances: "DisturbanceSet",
+        unit: str,
+        hand: "HandObject | None",
+        metrics: dict[str, np.ndarray],
     ) -> int:
         from jaxgrasp.cli.report import Clock, print_ranking, progress_bar
         from jaxgrasp.ranking import RankingInterrupted, rank
@@ -145,6 +157,7 @@ class Rank:
                     cone_edges=self.cone_edges,
                     share=self.share,
                     top=self.top,
+                    metrics=metrics,
                     progress=progress,
                 )
         except RankingInterrupted as interruption:

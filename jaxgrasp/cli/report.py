@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxgrasp.ranking import Ranking
+from jaxgrasp.ranking import MetricComparison, Ranking
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.synthesis import Record, Synthesis
 
@@ -140,7 +140,8 @@ def print_ranking(ranking: Ranking, unit: str, clock: Clock, written: Sequence[P
         written: The files that were written.
     """
     # Without a terminal rich would assume 80 columns and cut names short.
-    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
+    width = _PLAIN_WIDTH + 26 * len(ranking.metrics)
+    console = Console(width=None if sys.stdout.isatty() else width, highlight=False)
     rows = min(len(ranking.forces), _ROWS)
     if rows:
         console.print(_table(ranking, rows, unit))
@@ -155,14 +156,49 @@ def print_ranking(ranking: Ranking, unit: str, clock: Clock, written: Sequence[P
         console.print("written: " + ", ".join(map(str, written)), markup=False)
 
 
+def print_comparison(found: MetricComparison, outcome: str, count: int, written: Sequence[Path]) -> None:
+    """Prints a comparison of metrics to standard output.
+
+    Args:
+        found: The comparison.
+        outcome: What a success is called.
+        count: How many grasps there are.
+        written: The files that were written.
+    """
+    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH + 8 * len(found.names), highlight=False)
+    prediction = found.prediction
+    table = Table(title=f"{len(found.names)} metrics on {count:,} grasps; Spearman's rank correlation by number")
+    columns = ["answered"]
+    if prediction:
+        columns += [f"AUC of {outcome}", "95 %", f"{found.names[0]} leads by", "95 %"]
+    for name in ("#", "metric", *columns, *map(str, range(1, len(found.names) + 1))):
+        table.add_column(escape(name), justify="left" if name == "metric" else "right")
+    for row, name in enumerate(found.names):
+        cells = [f"{found.answered[row]:,}"]
+        if prediction:
+            (low, high), (lead, least, most) = prediction.interval[row], prediction.lead[row]
+            cells += [f"{prediction.auc[row]:.3f}", f"{low:.3f} .. {high:.3f}"]
+            cells += [f"{lead:+.3f}", f"{least:+.3f} .. {most:+.3f}"] if row else ["", ""]
+        table.add_row(str(row + 1), escape(name), *cells, *(f"{value:.2f}" for value in found.correlation[row]))
+    console.print(table)
+    if not prediction:
+        console.print("no column of success: no ROC curves")
+    if written:
+        console.print("written: " + ", ".join(map(str, written)), markup=False)
+
+
 def _table(ranking: Ranking, rows: int, unit: str) -> Table:
     candidates = ranking.candidates
     texts = [name for name, column in candidates.columns.items() if column.dtype.kind == "U" and column.ndim == 1]
-    table = Table(title=f"The best {rows} of {len(ranking.margin):,}; forces for {ranking.share:.0%} of the margin")
+    by = f" by {next(iter(ranking.metrics))}" if ranking.metrics else ""
+    title = f"The best {rows} of {len(ranking.margin):,}{by}; forces for {ranking.share:.0%} of the margin"
+    table = Table(title=title)
     texts = texts[:_TEXT_COLUMNS]
-    numbers = (f"margin [{unit}]", "upper bound", "largest normal force [N]", "effort [N²]")
-    for name in ("rank", "grasp", *texts, *numbers[:2], "status", *numbers[2:]):
-        table.add_column(escape(name), justify="right" if name == "rank" or name in numbers else "left")
+    others = [name for name in ranking.metrics if name != "margin"]
+    numbers = (f"margin [{unit}]", "upper bound", "largest normal force [N]", "effort [N²]", *others)
+    for name in ("rank", "grasp", *texts, *others, *numbers[:2], "status", *numbers[2:4]):
+        justify, overflow = "right" if name == "rank" or name in numbers else "left", "fold" if name in others else None
+        table.add_column(escape(name), justify=justify, overflow=overflow or "ellipsis")
     for place, row in enumerate(ranking.order[:rows]):
         source = Path(candidates.sources[candidates.source[row]]).name
         normal = -np.where(candidates.active[row], ranking.forces[place, :, 2], 0.0).min()
@@ -170,6 +206,7 @@ def _table(ranking: Ranking, rows: int, unit: str) -> Table:
             str(place + 1),
             escape(f"{source}:{candidates.index[row]}"),
             *(escape(str(candidates.columns[name][row])) for name in texts),
+            *(f"{ranking.metrics[name][row]:.4g}" for name in others),
             f"{ranking.margin[row]:.4g}",
             f"{ranking.upper_bound[row]:.4g}",
             Status(int(ranking.status[row])).name,

@@ -1,13 +1,20 @@
 """Many candidates scored, sorted and written."""
 
+from jaxgrasp.ranking.comparison import MetricComparison, Prediction, compare_metrics
 from jaxgrasp.ranking.rank import Ranking, RankingInterrupted, rank
+from jaxgrasp.ranking.scores import check_metrics, score
 from jaxgrasp.ranking.table import TABLE_ENDINGS, ranking_table, write_table
 
 __all__ = [
     "TABLE_ENDINGS",
+    "MetricComparison",
+    "Prediction",
     "Ranking",
     "RankingInterrupted",
+    "check_metrics",
+    "compare_metrics",
     "rank",
     "ranking_table",
+    "score",
     "write_table",
 ]

@@ -1,13 +1,15 @@
 """The ranking of many candidates by their robustness margin, with the tightening forces of the best."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxgrasp.candidates import Candidates
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.metrics import METRICS
+from jaxgrasp.ranking.scores import check_metrics
 from jaxgrasp.ranking.tiles import columns_of, margins, solve_in_tiles, tightening
 from jaxgrasp.solvers.status import Status
 
@@ -33,7 +35,8 @@ class Ranking:
 
     order: Int[np.ndarray, " batch"]
     """Candidates, the best first: SOLVED and UNBOUNDED by falling margin, then MAX_ITERATIONS and ILL_CONDITIONED,
-    INFEASIBLE and INVALID_INPUT, each by falling margin with NaN last; equals by their number."""
+    INFEASIBLE and INVALID_INPUT, each by falling margin with NaN last; equals by their number. With metrics: by the
+    first of them, the better ones first and NaN last."""
 
     share: float
     """The part of the margin that the tightening forces below are found for."""
@@ -52,6 +55,9 @@ class Ranking:
 
     controls: Float[np.ndarray, "top actuators"]
     """Commands with which a hand's actuators squeeze as hard; NaN where there is no answer."""
+
+    metrics: dict[str, Float[np.ndarray, " batch"]] = field(default_factory=dict)
+    """Other metrics by name, that which ranks first."""
 
     @property
     def rank(self) -> Int[np.ndarray, " batch"]:
@@ -82,6 +88,7 @@ def rank(
     cone_edges: int = 8,
     share: float = 0.75,
     top: int = 10,
+    metrics: Mapping[str, Float[np.ndarray, " batch"]] | None = None,
     tile: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Ranking:
@@ -96,6 +103,7 @@ def rank(
         cone_edges: Edges of the friction pyramid, at least 3.
         share: The part of its margin, in (0, 1], for which the tightening forces of a candidate are found.
         top: How many of the best get tightening forces.
+        metrics: Of all candidates, from `score`; where there are any, the first ranks in place of the margin.
         tile: Candidates at a time, at most; None chooses by platform.
         progress: Called after each tile of (21) with the number of candidates done.
 
@@ -103,7 +111,7 @@ def rank(
         The ranking.
 
     Raises:
-        ValueError: `share` is not in (0, 1] or `top` is negative.
+        ValueError: `share` is not in (0, 1], `top` is negative or a metric is unknown.
         RankingInterrupted: Ctrl-C or an error of the device; it holds what was ranked before.
 
     Status:
@@ -115,7 +123,8 @@ def rank(
         raise ValueError(f"top: got {top}; wanted a number that is not negative")
     if disturbances is None:
         disturbances = DisturbanceSet.forces(1.0)
-    scores = _Scores.none(len(candidates))
+    check_metrics(list(metrics or {}))
+    scores = _Scores.none(len(candidates), dict(metrics or {}))
     columns = columns_of(candidates)
     settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": tile}
     try:
@@ -138,17 +147,22 @@ class _Scores:
     margin: np.ndarray
     upper_bound: np.ndarray
     status: np.ndarray
+    metrics: dict[str, np.ndarray]
     done: int
 
     @staticmethod
-    def none(count: int) -> "_Scores":
-        return _Scores(margin=np.empty(count), upper_bound=np.empty(count), status=np.empty(count, dtype=int), done=0)
+    def none(count: int, metrics: dict[str, np.ndarray]) -> "_Scores":
+        margin, upper_bound, status = np.empty(count), np.empty(count), np.empty(count, dtype=int)
+        return _Scores(margin=margin, upper_bound=upper_bound, status=status, metrics=metrics, done=0)
 
     def fill(self, rows: slice, margin: np.ndarray, upper_bound: np.ndarray, status: np.ndarray) -> None:
         self.margin[rows], self.upper_bound[rows], self.status[rows] = margin, upper_bound, status
         self.done = rows.stop
 
     def order(self) -> np.ndarray:
+        for name, value in self.metrics.items():
+            found = value[: self.done] if METRICS[name].larger_is_better else -value[: self.done]
+            return np.lexsort((np.where(np.isnan(found), 0.0, -found), np.isnan(found)))
         margin, status = self.margin[: self.done], self.status[: self.done]
         group = np.ones(self.done, dtype=int)
         group[np.isin(status, _ANSWERED)] = 0
@@ -177,4 +191,5 @@ class _Scores:
             effort=effort,
             tightening_status=tightening_status,
             controls=controls,
+            metrics={name: value[: self.done] for name, value in self.metrics.items()},
         )

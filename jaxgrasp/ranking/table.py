@@ -25,9 +25,9 @@ def ranking_table(ranking: Ranking, ranks: slice = slice(None)) -> dict[str, np.
 
     Returns:
         Arrays with a leading axis of N by name: rank; source and index, the file and the row in it; margin and
-        upper_bound, multiples of the disturbance set; status; effort, N^2, and forces (N, n_c, 3), N, on the object in
-        its frame, NaN for all but the best, like the controls (N, n_u) of a hand; mass where any is known; and what
-        travelled along, with `input_` before a name that the table has itself.
+        upper_bound, multiples of the disturbance set; status; other metrics that were asked for; effort, N^2, and
+        forces (N, n_c, 3), N, on the object in its frame, NaN for all but the best, like the controls (N, n_u) of a
+        hand; mass where any is known; and what travelled along, with `input_` before a name that the table has itself.
     """
     candidates, order = ranking.candidates, ranking.order[ranks]
     rank = np.arange(1, len(ranking.order) + 1)[ranks]
@@ -43,6 +43,7 @@ def ranking_table(ranking: Ranking, ranks: slice = slice(None)) -> dict[str, np.
         "margin": ranking.margin[order],
         "upper_bound": ranking.upper_bound[order],
         "status": np.array([status.name for status in Status])[ranking.status[order]],
+        **{name: value[order] for name, value in ranking.metrics.items() if name != "margin"},
         "effort": effort,
         "forces": forces,
     }

@@ -45,6 +45,18 @@ def columns_of(candidates: Candidates) -> Columns:
     return columns | candidates.hand
 
 
+def contacts_of(columns: Columns) -> Contacts:
+    """The contacts of candidates by their columns."""
+    make = Contacts.from_frames if "frames" in columns else Contacts.from_normals
+    return make(
+        columns["positions"],
+        columns["frames"] if "frames" in columns else columns["outward_normals"],
+        friction=columns["friction"],
+        max_force=columns["max_force"],
+        active=columns["active"],
+    )
+
+
 def solve_in_tiles(
     solver: Callable[..., Any],
     columns: Columns,
@@ -53,6 +65,7 @@ def solve_in_tiles(
     gravity: float,
     cone_edges: int,
     tile: int | None,
+    spread: bool = True,
 ) -> Iterator[tuple[slice, Any]]:
     """Runs a solver over all candidates, one tile after the other with one compilation.
 
@@ -63,11 +76,14 @@ def solve_in_tiles(
         gravity: Along the object's -z, m/s^2; zero means that no weight but that of `required_wrench` need be borne.
         cone_edges: Edges of the friction pyramid.
         tile: Candidates at a time, at most; None chooses by platform.
+        spread: Whether over all devices of this process. On several CPU devices at once, batches of LAPACK's routines
+            were seen to wait for each other for ever.
 
     Yields:
         The rows of each tile and the solver's answer for them, in NumPy.
     """
-    mesh = Mesh(np.array(jax.local_devices()), ("candidates",))
+    devices = jax.local_devices()
+    mesh = Mesh(np.array(devices if spread else devices[:1]), ("candidates",))
     count = len(columns["positions"])
     tile = tile or TILE.get(jax.default_backend(), ACCELERATOR_TILE)
     # Tiles of equal size waste less than a last one that is mostly padding.
@@ -105,14 +121,7 @@ def _solve_tile(
     columns: Any, disturbances: DisturbanceSet, gravity: Any, solver: Any, cone_edges: int, loaded: bool, mesh: Mesh
 ) -> Any:
     def on_one_device(columns: Any, disturbances: DisturbanceSet, gravity: Any) -> Any:
-        make = Contacts.from_frames if "frames" in columns else Contacts.from_normals
-        contacts = make(
-            columns["positions"],
-            columns["frames"] if "frames" in columns else columns["outward_normals"],
-            friction=columns["friction"],
-            max_force=columns["max_force"],
-            active=columns["active"],
-        )
+        contacts = contacts_of(columns)
         load = columns.get("required_wrench")
         if loaded:
             load = required_wrench(columns["mass"], gravity=jnp.array([0.0, 0.0, -1.0]) * gravity)

@@ -1,8 +1,30 @@
-"""The paper: worst cases (17)-(18), robustness margin (21), least effort (22), blocking forces (15)."""
+"""The paper: worst cases (17)-(18), margin (21), least effort (22), blocking forces (15), and the way to them."""
 
 from jaxgrasp.robustness.blocking import blocking_forces
+from jaxgrasp.robustness.comparison import (
+    Comparison,
+    SpecifiedDisturbances,
+    compare_formulations,
+    specified_disturbances,
+)
+from jaxgrasp.robustness.formulations import FormulationSolution, formulation_margin
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening import largest_disturbance, least_effort
+from jaxgrasp.robustness.total_effort import TotalEffortSolution, least_total_effort
 from jaxgrasp.robustness.worst_case import worst_case
 
-__all__ = ["Solution", "blocking_forces", "largest_disturbance", "least_effort", "worst_case"]
+__all__ = [
+    "Comparison",
+    "FormulationSolution",
+    "Solution",
+    "SpecifiedDisturbances",
+    "TotalEffortSolution",
+    "blocking_forces",
+    "compare_formulations",
+    "formulation_margin",
+    "largest_disturbance",
+    "least_effort",
+    "least_total_effort",
+    "specified_disturbances",
+    "worst_case",
+]

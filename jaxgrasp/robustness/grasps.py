@@ -13,14 +13,14 @@ from jaxgrasp.arrays import as_float, broadcast_batch, fold
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, inverse_root
-from jaxgrasp.contact.contacts import Contacts
+from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
-from jaxgrasp.solvers.lanes import TILE
+from jaxgrasp.solvers.lanes import LOOSE_TILE, TILE
 
 
 @jax.tree_util.register_dataclass
@@ -168,13 +168,13 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
         return _admit(raw, terms.terms, extents)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = not {"compliance", "per_vertex", "weights"} & set(arguments)
+    compact = kernel.tile is None and not {"compliance", "per_vertex", "weights"} & set(arguments)
     rows = n * (kernel.rows + 1)
     if given["actuation"] is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.
         joints, actuators = given["actuation"].transmission.shape[-2:]
         rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
-    lanes = Lanes(admit, shared, rows, compact)
+    lanes = Lanes(admit, shared, rows, compact, kernel.tile or LOOSE_TILE)
     out = differentiable(kernel, lanes, arguments)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
@@ -237,7 +237,7 @@ def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[ja
     """Check the data of every lane and replace what cannot be used."""
     positions, frames, active = raw["positions"], raw["frames"], raw["active"]
     n, dtype = positions.shape[0], positions.dtype
-    sound = jnp.isfinite(positions).all(1) & _rotations(frames)
+    sound = jnp.isfinite(positions).all(1) & rotations(frames)
     sound &= (raw["friction"] >= 0) & jnp.isfinite(raw["friction"])
     sound &= (raw["max_force"] > 0) & jnp.isfinite(raw["max_force"])
     half, usable = inverse_root(_masked(raw.get("compliance"), active), n)
@@ -329,17 +329,6 @@ def _actuated(
         upper=jnp.where(valid, raw["upper"], 1),
     )
     return limited(actuated, friction, jnp.where(there, max_force, 0))
-
-
-def _rotations(frames: jax.Array) -> jax.Array:
-    """Which frames (n, 3, 3, *lanes) are rotations, (n, *lanes)."""
-    tolerance = 1e-6 if frames.dtype == jnp.float64 else 1e-4
-    t1, t2, normal = ([frames[:, r, a] for r in range(3)] for a in range(3))
-    cross = [t1[1] * t2[2] - t1[2] * t2[1], t1[2] * t2[0] - t1[0] * t2[2], t1[0] * t2[1] - t1[1] * t2[0]]
-    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # noqa: E731
-    near = lambda x, y: jnp.abs(x - y) <= tolerance  # noqa: E731
-    aligned = near(cross[0], normal[0]) & near(cross[1], normal[1]) & near(cross[2], normal[2])
-    return near(dot(t1, t1), 1) & near(dot(t2, t2), 1) & near(dot(t1, t2), 0) & aligned
 
 
 def _masked(matrices: jax.Array | None, active: jax.Array) -> jax.Array | None:

@@ -29,21 +29,29 @@ class Lanes:
     shared: by name of the argument.
     rows: how many rows a lane has, which sets the size of a tile.
     compact: whether a tile can be one function, see `map_lanes`.
+    tile: lanes of a tile that cannot.
     """
 
     admit: Callable[[Raw], Any]
     shared: dict[str, bool]
     rows: int
     compact: bool
+    tile: int
 
 
 class Kernel(Protocol):
     """What is computed for every lane, and how it varies with the arguments.
 
     rows: how many rows a contact has but for the bound on its force, which sets the size of a tile.
+    tile: None where it is free of library calls and large reductions, else how many lanes to work on, see `map_lanes`.
     """
 
     rows: int
+
+    @property
+    def tile(self) -> int | None:
+        """See above."""
+        ...
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
@@ -60,6 +68,7 @@ class OfPyramids:
     """A kernel with the rows of friction pyramids."""
 
     cone_edges: int
+    tile = None
 
     @property
     def rows(self) -> int:
@@ -69,6 +78,8 @@ class OfPyramids:
 
 class Plain(ABC):
     """A kernel of one stage that is its own derivative's function."""
+
+    tile = None
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
@@ -155,7 +166,7 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()
 
         shared = (lanes.shared, jax.tree.map(lambda _: False, held))
         stages = (enter, *kernel.stages[1:])
-        return map_lanes(stages, (arguments, held), shared, lanes.rows, compact=lanes.compact)
+        return map_lanes(stages, (arguments, held), shared, lanes.rows, compact=lanes.compact, tile=lanes.tile)
 
     @partial(value.defjvp, symbolic_zeros=True)
     def derivative(primals: tuple, dots: tuple) -> tuple[Tree, Tree]:

@@ -25,7 +25,7 @@ from jaxgrasp.solvers.block_kkt import Blocks, Record, Rows
 from jaxgrasp.solvers.interior_point import Iterate
 
 # Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
-_LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
+LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
 
 
 @jax.tree_util.register_dataclass
@@ -131,7 +131,7 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     """Scale the programs of a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
     cone, bound, effort, basis = worst_rows(grasps, cone_edges)
-    tangential = jnp.maximum(grasps.friction, _LEAST_FRICTION[dtype.name]) * grasps.max_force
+    tangential = jnp.maximum(grasps.friction, LEAST_FRICTION[dtype.name]) * grasps.max_force
     normal = grasps.max_force
 
     @fenced

@@ -136,7 +136,7 @@ def _substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[j
     return out
 
 
-def _inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array:
+def inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array:
     """L^-1 of a symmetric positive definite (eq, eq, *lanes).
 
     Pivots are clamped at a floor (eq, *lanes), eps of the diagonal. Large matrices are cut in two: L^-1 is made of
@@ -149,9 +149,9 @@ def _inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Arra
         floor = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix)
     if size > _UNDIVIDED:
         half = size // 2
-        first = _inverse_root(matrix[:half, :half], floor[:half])
+        first = inverse_root(matrix[:half, :half], floor[:half])
         across = _times_transposed(matrix[half:, :half], first)
-        last = _inverse_root(matrix[half:, half:] - _times_transposed(across, across), floor[half:])
+        last = inverse_root(matrix[half:, half:] - _times_transposed(across, across), floor[half:])
         corner = -_times(last, _times(across, first))
         zero = jnp.zeros((half, size - half, *lanes), matrix.dtype)
         return jnp.concatenate([jnp.concatenate([first, zero], 1), jnp.concatenate([corner, last], 1)])
@@ -264,7 +264,7 @@ class BlockProblem:
             return matrix if v is None else matrix + v[:, None] * (v * border)
 
         matrix, v, border = reduce(blocks)
-        return Factors(blocks, _inverse_root(complete(matrix, v, border)), weights, border, v)
+        return Factors(blocks, inverse_root(complete(matrix, v, border)), weights, border, v)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
         """Orthogonalise [A, sigma] column by column, in the inner product that the weights give.

@@ -30,7 +30,13 @@ LARGE_TILE = 1 << 17
 
 
 def map_lanes(
-    stages: tuple[Callable[[Tree], Tree], ...], arguments: Tree, shared: Tree, rows: int, *, compact: bool
+    stages: tuple[Callable[[Tree], Tree], ...],
+    arguments: Tree,
+    shared: Tree,
+    rows: int,
+    *,
+    compact: bool,
+    tile: int = LOOSE_TILE,
 ) -> Tree:
     """Run a kernel over the leading axis of its arguments.
 
@@ -42,6 +48,7 @@ def map_lanes(
         compact: the kernel is free of library calls and large reductions, so that a stage of a tile can be one function
             on CPUs.
         rows: how many rows a lane has, which sets the size of a tile.
+        tile: how many lanes a tile has where it cannot be one function.
 
     Returns:
         What the last stage returns, leaves (lanes, ...).
@@ -52,20 +59,20 @@ def map_lanes(
             x if s else jnp.zeros((1, *x.shape[1:]), x.dtype)
             for x, s in zip(leaves, jax.tree.leaves(shared), strict=True)
         ]
-        shapes = jax.eval_shape(_run(stages, structure, tuple(jax.tree.leaves(shared)), 0), one)
+        shapes = jax.eval_shape(_run(stages, structure, tuple(jax.tree.leaves(shared)), 0, tile), one)
         return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), shapes)
-    return _run(stages, structure, tuple(jax.tree.leaves(shared)), rows if compact else 0)(leaves)
+    return _run(stages, structure, tuple(jax.tree.leaves(shared)), rows if compact else 0, tile)(leaves)
 
 
-def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int) -> Callable:
+def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int, tile: int) -> Callable:
     @custom_vmap
     def run(leaves: list[jax.Array]) -> Tree:
-        return tiled(stages, structure, shared, rows, leaves)
+        return tiled(stages, structure, shared, rows, leaves, tile)
 
     @run.def_vmap
     def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
         merged, still_shared, lanes = merged_axes(leaves, batched[0], shared, size)
-        out = _run(stages, structure, still_shared, rows)(merged)
+        out = _run(stages, structure, still_shared, rows, tile)(merged)
         out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
@@ -98,7 +105,12 @@ def merged_axes(
 
 
 def tiled(
-    stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int, leaves: list[jax.Array]
+    stages: tuple[Callable, ...],
+    structure: Any,
+    shared: tuple[bool, ...],
+    rows: int,
+    leaves: list[jax.Array],
+    loose: int = LOOSE_TILE,
 ) -> Tree:
     """`map_lanes` of leaves, without a rule for `jax.vmap`; rows are 0 where tiles cannot be compact."""
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
@@ -138,7 +150,7 @@ def tiled(
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
         largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
         compact = rows > 0 and lanes > size and largest <= LARGEST_LEAF
-        size = size if rows and largest <= LARGEST_LEAF else LOOSE_TILE
+        size = size if rows and largest <= LARGEST_LEAF else loose
 
         def one(parts: list[jax.Array]) -> Tree:
             with fences(True):

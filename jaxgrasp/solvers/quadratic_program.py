@@ -181,7 +181,7 @@ def solve_qp(
         INVALID_INPUT for data that are not finite, or P that is not positive semidefinite.
     """
     q = as_float("q", q, ("n",))
-    n = q.shape[-1]
+    n, linear = q.shape[-1], P is None
     P = jnp.zeros((n, n), q.dtype) if P is None else as_float("P", P, (n, n))
     rows = [*_pair("A", A, "b", b, n, q.dtype), *_pair("G", G, "h", h, n, q.dtype)]
     dtype = jnp.result_type(P, q, *rows)
@@ -199,7 +199,10 @@ def solve_qp(
             for v, k in zip(program, events, strict=True)
         )
     )
-    solution = jax.vmap(_solve_one)(lanes)
+    # One zero matrix for all: XLA would fold what it computes of a whole batch of them while it compiles, for seconds.
+    first = program.P.astype(dtype) if linear else lanes.P
+    solve = jax.vmap(lambda *data: _solve_one(Program(*data)), in_axes=(None if linear else 0, 0, 0, 0, 0, 0))
+    solution = solve(first, *lanes[1:])
     return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solution)
 
 

@@ -1,5 +1,6 @@
 """Figures of grasps and rankings, made with matplotlib and no window."""
 
+from jaxgrasp.viewer.comparison import figure_of_comparison
 from jaxgrasp.viewer.grasp import draw_grasp
 from jaxgrasp.viewer.movie import write_movie
 from jaxgrasp.viewer.ranking import figure_of_ranking, write_figure
@@ -8,6 +9,7 @@ from jaxgrasp.viewer.synthesis import figure_of_synthesis
 
 __all__ = [
     "draw_grasp",
+    "figure_of_comparison",
     "figure_of_motions",
     "figure_of_pushes",
     "figure_of_ranking",

@@ -1,0 +1,82 @@
+"""Metrics of the grasp map alone: singular values, and the residual of unit normal forces."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxgrasp.arrays import safe_divide, safe_norm
+from jaxgrasp.contact import Contacts
+from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, hidden
+
+
+def smallest_singular_value(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
+    """The smallest of the six singular values of the grasp map: how far the grasp is from one that loses a direction.
+
+    Li and Sastry, "Task-oriented optimal grasping by multifingered robot hands" (IEEE J. Robotics and Automation,
+    1988). Friction is not asked. Moment rows are divided by the length of `space` and are about its reference.
+
+    Args:
+        contacts: the grasps.
+        space: conventions, of which the edges do not matter; `WrenchSpace()` where None.
+
+    Returns:
+        (*batch,), 0 where the map has not full rank; NaN for data that are not admissible. Differentiable; where
+        several singular values are equal, by one of them.
+
+    Raises:
+        ValueError: options or shapes that do not fit.
+    """
+    edges = edges_of(contacts, space)
+    return hidden(edges, _extreme(edges.grasp_map)[0])
+
+
+def isotropy(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
+    """The smallest over the largest singular value of the grasp map, 1 where all directions are alike.
+
+    Kim, Oh, Yi and Suh, "Optimal grasping based on non-dimensionalized performance indices" (IROS 2001), the grasp
+    isotropy index; conventions as for `smallest_singular_value`.
+
+    Args:
+        contacts: the grasps.
+        space: conventions, of which the edges do not matter; `WrenchSpace()` where None.
+
+    Returns:
+        (*batch,), between 0 and 1; NaN for data that are not admissible. Differentiable.
+
+    Raises:
+        ValueError: options or shapes that do not fit.
+    """
+    edges = edges_of(contacts, space)
+    return hidden(edges, safe_divide(*_extreme(edges.grasp_map)))
+
+
+def closure_residual(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
+    """|G c|, the wrench that is left where every finger pushes with a normal force of 1: the smaller the better.
+
+    Liu et al., "Synthesizing diverse and physically stable grasps with arbitrary hand structures using differentiable
+    force closure estimator" (IEEE RA-L 2022, arXiv 2104.09194): friction, which could balance what is left, is not
+    asked. There moments are in N m (length 1) about the origin of the object's frame.
+
+    Args:
+        contacts: the grasps.
+        space: conventions, of which the edges do not matter; `WrenchSpace()` where None.
+
+    Returns:
+        (*batch,), NaN for data that are not admissible. Differentiable; at 0 the gradient is 0.
+
+    Raises:
+        ValueError: options or shapes that do not fit.
+    """
+    edges = edges_of(contacts, space)
+    return hidden(edges, safe_norm(edges.grasp_map[..., 2].sum(-2)))
+
+
+def _extreme(blocks: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The sixth and the first singular value of G from blocks (*batch, n_c, 6, 3)."""
+    G = jnp.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], 6, -1)
+    # The derivative of a singular value is that of |G'u| with its own u held.
+    held = lax.stop_gradient(G)
+    u = jnp.linalg.eigh(held @ jnp.swapaxes(held, -1, -2))[1]
+    length = lambda column: safe_norm(jnp.einsum("...ij,...i->...j", G, column))  # noqa: E731
+    return length(u[..., 0]), length(u[..., -1])

@@ -1,0 +1,197 @@
+"""The formulations (12), (13), (16) and their like as conic programs in scaled form.
+
+Two shapes. Where the answer delta f_j to a disturbance is free, f_0 + delta f_j is a force of its own: the directions
+fall apart, one program each, max lambda with G f = b - lambda W_j, and f_0 another. Where delta f_j is the blocking
+force (15), one f_0 is shared: the rows come in copies, one for each direction and one for rest.
+
+Per contact forces are scaled as in `program`: tangential by mu F, normal by F.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxgrasp.arrays import fold
+from jaxgrasp.contact.compliance import RANK_TOLERANCE, pseudo_inverse, whitened
+from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.robustness.grasps import Grasps
+from jaxgrasp.robustness.program import LEAST_FRICTION
+from jaxgrasp.solvers.conic_margin import ConeRows, ConicMargin
+
+
+class Formulation(NamedTuple):
+    """What distinguishes the formulations.
+
+    exact: Coulomb's cones, not pyramids.
+    free: delta f_j is free, not the blocking force (15).
+    shared: there has to be one f_0 for all directions.
+    """
+
+    exact: bool
+    free: bool
+    shared: bool
+
+
+FORMULATIONS = {
+    "12": Formulation(exact=True, free=True, shared=True),
+    "12_fixed": Formulation(exact=True, free=False, shared=True),
+    "13": Formulation(exact=False, free=True, shared=True),
+    "16": Formulation(exact=False, free=False, shared=True),
+    "per_direction": Formulation(exact=False, free=True, shared=False),
+    "per_direction_prestrained": Formulation(exact=False, free=False, shared=False),
+}
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Basics:
+    """What all formulations share; lanes trail."""
+
+    sizes: jax.Array
+    """(3, n, *lanes), N: forces = sizes * x."""
+    columns: jax.Array
+    """(6, 3, n, *lanes), the orthonormal rows of G for scaled forces; zero where dropped."""
+    dropped: jax.Array
+    """(6, *lanes), 1 where a row was dropped."""
+    load: jax.Array
+    """(6, *lanes), b in the orthonormal rows."""
+    targets: jax.Array
+    """(6, n_d, *lanes), W_j in them."""
+    answers: jax.Array | None
+    """(n_d, 3, n, *lanes): blocking forces for lambda = 1, N; None where no formulation asks for them."""
+    disturbed: jax.Array
+    """bool (n_d, *lanes): W_j is not zero."""
+    outside: jax.Array
+    """bool (n_d, *lanes): W_j is outside the range of G."""
+    load_outside: jax.Array
+    """bool (*lanes): b is."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Scaled:
+    """The programs of one formulation; lanes are (programs of a grasp, grasps).
+
+    Free answers: one program a direction, then that of f_0. Blocking forces: one program, or one a direction.
+    """
+
+    problem: ConicMargin
+    scale: jax.Array
+    """(D, *lanes): lambda = scale * lambda_hat."""
+
+
+def basics(grasps: Grasps, with_answers: bool) -> Basics:
+    """Scale a batch of grasps."""
+    dtype, present = grasps.present.dtype, grasps.present
+    tolerance = 10 * RANK_TOLERANCE[dtype.name]
+    tangential = jnp.maximum(grasps.friction, LEAST_FRICTION[dtype.name]) * grasps.max_force
+    sizes = jnp.stack([tangential, tangential, grasps.max_force])
+    mean = fold(jnp.add, grasps.max_force * present) / jnp.maximum(fold(jnp.add, present), 1)
+    mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
+    rows = whitened(grasps.columns * (sizes / mean))
+    (lanes,) = mean.shape
+    given = grasps.terms[0].wrenches
+    wrenches = jnp.swapaxes(jnp.broadcast_to(given, (*given.shape[:2], lanes)), 0, 1) * grasps.units[:, None]
+
+    def coordinates(wrench: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """In the orthonormal rows, and whether something is left outside them."""
+        spread = lambda x: x.reshape(*x.shape[:-1], *[1] * (wrench.ndim - 2), lanes)  # noqa: E731
+        own = fold(jnp.add, [spread(rows.operations[:, c]) * wrench[c] for c in range(6)])
+        lost = fold(jnp.maximum, jnp.abs(lax.stop_gradient(own)) * (1 - spread(rows.kept)))
+        return own * spread(rows.kept), lost > tolerance * fold(jnp.maximum, jnp.abs(wrench))
+
+    load, load_outside = coordinates(grasps.wrench / mean)
+    targets, outside = coordinates(wrenches / mean)
+    return Basics(
+        sizes=sizes,
+        columns=rows.rows,
+        dropped=1 - rows.kept,
+        load=load,
+        targets=targets,
+        answers=blocking(grasps, wrenches) if with_answers else None,
+        disturbed=fold(jnp.maximum, jnp.abs(wrenches)) > 0,
+        outside=outside,
+        load_outside=load_outside,
+    )
+
+
+def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_edges: int, norm_bound: bool) -> Scaled:
+    """The programs of one formulation for a batch of grasps."""
+    present, dtype = grasps.present, grasps.present.dtype
+    count, lanes = basics.disturbed.shape
+    parts = _patterns(form.exact, cone_edges, norm_bound, grasps.friction)
+    kinds = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
+    if form.free:
+        length = jnp.sqrt(lax.stop_gradient(fold(jnp.add, basics.targets * basics.targets)))
+        scale = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 1)
+        border = jnp.concatenate([basics.targets * scale, jnp.zeros((6, 1, lanes), dtype)], 1)
+        scale = jnp.concatenate([scale, jnp.ones((1, lanes), dtype)])
+        # The last program is for f_0: how deep inside all rows it can be.
+        last = (jnp.arange(count + 1) == count).astype(dtype)[:, None]
+        sigmas = [kind * last for kind in kinds]
+    else:
+        border = jnp.zeros((6, 1 if form.shared else count, lanes), dtype)
+        given = jnp.moveaxis(basics.answers / basics.sizes, 0, 2)
+        sigmas = [jnp.where(present[:, None] > 0, part.apply(given), 0) for part in parts]
+        largest = fold(jnp.maximum, [jnp.max(jnp.abs(sigma), (0, 1, 2)) for sigma in sigmas])
+        if form.shared:
+            largest = jnp.max(largest, 0, keepdims=True)
+            # Directions become copies, (d, n_d, n, 1, *lanes).
+            sigmas = [jnp.swapaxes(sigma, 1, 3) for sigma in sigmas]
+        # Where nothing disturbs, lambda asks how deep inside all rows f_0 can be.
+        idle = largest == 0
+        scale = lax.stop_gradient(1 / jnp.where(idle, 1, largest))
+        sigmas = [
+            jnp.concatenate(
+                [jnp.where(idle, kind, sigma * scale), jnp.where(idle, kind, jnp.zeros_like(sigma[:, :1]))], 1
+            )
+            for sigma, kind in zip(sigmas, kinds, strict=True)
+        ]
+    lift = lambda sigma: jnp.broadcast_to(sigma, (*sigma.shape[:3], *border.shape[1:]))  # noqa: E731
+    problem = ConicMargin(
+        rows=tuple(replace(part, sigma=lift(sigma)) for part, sigma in zip(parts, sigmas, strict=True)),
+        columns=basics.columns[..., None, :],
+        border=border,
+        rhs=jnp.broadcast_to(basics.load[:, None], border.shape),
+        dropped=basics.dropped[:, None],
+    )
+    return Scaled(problem=problem, scale=scale)
+
+
+def blocking(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
+    """-G*_j W_j (n_d, 3, n, *lanes) of wrenches (6, n_d, *lanes), N."""
+    if grasps.vertex_halves is None:
+        inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+        forces = -jnp.einsum("aen...,ed...->dan...", inverse, wrenches)
+    else:
+        one = lambda each: -jnp.einsum("aen...,e...->an...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
+        forces = lax.map(one, (grasps.vertex_halves, jnp.swapaxes(wrenches, 0, 1)))
+    return jnp.where(grasps.present > 0, forces, 0)
+
+
+def _patterns(exact: bool, cone_edges: int, norm_bound: bool, friction: jax.Array) -> list[ConeRows]:
+    """The rows of a contact, without sigma: friction, then the bound on the force."""
+    none = jnp.zeros((1, 1, 1, 1, 1), friction.dtype)
+    make = lambda kind, patterns, h, stretch=None: ConeRows(  # noqa: E731
+        second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch
+    )
+    normal = (0.0, 0.0, -1.0)
+    if not exact:
+        facets = pyramid_facets(cone_edges).tolist()
+        return [make(False, [*facets, normal], (*[0.0] * cone_edges, 1.0))]
+    coulomb = make(True, [(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)], (0.0, 0.0, 0.0))
+    if not norm_bound:
+        return [coulomb, make(False, [normal], (1.0,))]
+    slip = jnp.maximum(friction, LEAST_FRICTION[friction.dtype.name])[:, None]
+    stretch = jnp.stack([slip, slip, jnp.ones_like(slip)])
+    return [coulomb, make(True, [(0.0, 0.0, 0.0), *(-np.eye(3)).tolist()], (1.0, 0.0, 0.0, 0.0), stretch)]
+
+
+def _identity(second_order: bool, rows: int, dtype: jnp.dtype) -> jax.Array:
+    """The identity of the rows' cones, (d, 1, 1, 1, 1)."""
+    row = np.eye(rows)[0] if second_order else np.ones(rows)
+    return jnp.asarray(row, dtype).reshape(-1, 1, 1, 1, 1)

@@ -1,0 +1,209 @@
+"""The least-effort program (11) over the tightening forces and all answers to the disturbances."""
+
+from dataclasses import dataclass, fields
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from jaxgrasp.arrays import fold
+from jaxgrasp.contact.contacts import Contacts
+from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Scaled, basics, scaled_formulation
+from jaxgrasp.robustness.formulations import FormulationSolution, check_vertices, formulation_answer, outcome, tile_of
+from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.kernels import Along, OfPyramids
+from jaxgrasp.solvers import interior_point
+from jaxgrasp.solvers.arrow_problem import ArrowProblem, ArrowRecord, patterns_of
+from jaxgrasp.solvers.interior_point import Settings
+from jaxgrasp.solvers.status import Status
+
+_SETTINGS = {
+    "float64": Settings(
+        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
+    ),
+    "float32": Settings(
+        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=5
+    ),
+}
+_ACCEPTED = {"float64": 1e-7, "float32": 1e-3}
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class TotalEffortSolution:
+    """What `least_total_effort` answers."""
+
+    effort: Float[Array, "*batch"]
+    """The optimum: 1/2 f_0' Q_0 f_0 + sum_j 1/2 delta f_j' Q delta f_j; NaN where there is no answer."""
+    lower_bound: Float[Array, "*batch"]
+    """Certified by multipliers: no forces do with less."""
+    forces: Float[Array, "*batch contacts 3"]
+    """f_0, contact frames, N; 0 for absent contacts, NaN where there is no answer."""
+    changes: Float[Array, "*batch directions contacts 3"]
+    """delta f_j, contact frames, N."""
+    status: Int[Array, "*batch"]
+    """`Status`."""
+    iterations: Int[Array, "*batch"]
+    """Interior-point steps, after those of (13)."""
+
+
+def least_total_effort(
+    contacts: Contacts,
+    disturbances: DisturbanceSet,
+    margin: ArrayLike = 1.0,
+    required_wrench: ArrayLike | None = None,
+    compliance: ArrayLike | None = None,
+    effort_weights: ArrayLike | None = None,
+    cone_edges: int = 8,
+) -> TotalEffortSolution:
+    """Program (11): tightening forces and free answers to every disturbance, of least effort together.
+
+    min 1/2 f_0' Q_0 f_0 + sum_j 1/2 delta f_j' Q delta f_j over (f_0, delta f_1 .. delta f_nd) subject to G f_0 = b,
+    G delta f_j = -margin W_j, and the rows of the pyramids and of |f_n| <= f_max for f_0 and for every f_0 + delta f_j.
+
+    Solves (13) first, which says whether there are such forces, and where to start.
+
+    Args:
+        contacts: the grasps; their dtype is the precision.
+        disturbances: W_j, a single `DisturbanceSet.vertices` or `.forces`.
+        margin: (*batch,), >= 0: what the disturbances are scaled by.
+        required_wrench: b (*batch, 6), N and N m; None is zero.
+        compliance: Q as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the identity.
+        effort_weights: Q_0, as blocks; None is the identity.
+        cone_edges: n_e.
+
+    Returns:
+        TotalEffortSolution with `*batch` axes.
+
+    Raises:
+        ValueError: shapes or options that do not fit; at trace time.
+
+    Status:
+        SOLVED; INFEASIBLE (no such forces: the margin is above (13)'s); MAX_ITERATIONS; INVALID_INPUT.
+
+    Derivatives:
+        Of effort and lower_bound, first order, with respect to everything that is continuous (envelope theorem).
+    """
+    pyramid_facets(cone_edges)
+    check_vertices(disturbances)
+    if compliance is not None and jnp.shape(compliance)[-3:] != (contacts.n_c, 3, 3):
+        raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {contacts.n_c}, 3, 3)")
+    return over_grasps(
+        _TotalEffort(cone_edges, tile_of(contacts, disturbances)),
+        contacts,
+        disturbances,
+        required_wrench=required_wrench,
+        compliance=compliance,
+        effort_weights=effort_weights,
+        margin=margin,
+    )[0]
+
+
+@dataclass(frozen=True)
+class _TotalEffort(OfPyramids):
+    tile: int
+
+    @property
+    def stages(self) -> tuple:
+        return (
+            lambda grasps, _: (grasps, *self._free(grasps)),
+            lambda given: self._start(*given),
+            lambda given: self._solve(*given),
+        )
+
+    def tangents(self, along: Along, out: tuple) -> tuple:
+        solution, record = out
+        (change,) = along.adjoint(self._adjoint, out, (solution.effort,))
+        moved = {"effort": change, "lower_bound": change}
+        return TotalEffortSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), ArrowRecord(*[None] * 5)
+
+    def _free(self, grasps: Grasps) -> tuple[Basics, Scaled]:
+        shared = basics(grasps, False)
+        return shared, scaled_formulation(grasps, shared, FORMULATIONS["13"], self.cone_edges, False)
+
+    def _start(self, grasps: Grasps, shared: Basics, free: Scaled) -> tuple:
+        found = outcome(grasps, shared, free, True)
+        answer = formulation_answer(grasps, shared, free, FORMULATIONS["13"], found)
+        # Each direction on its way from f_0 to the most that it allows: inside the rows.
+        some = jnp.isfinite(answer.directions) & (answer.directions > 0)
+        share = jnp.where(some, grasps.margin / jnp.where(some, answer.directions, 1), 0)
+        x, rest = found.point.x, found.point.x[:, :, -1:]
+        guess = jnp.concatenate([rest + jnp.clip(share, 0, 1) * (x[:, :, :-1] - rest), rest], 2)
+        return grasps, shared, answer, guess
+
+    def _solve(self, grasps: Grasps, shared: Basics, answer: FormulationSolution, guess: jax.Array) -> tuple:
+        problem, unit = _problem(grasps, shared, self.cone_edges, guess)
+        dtype = unit.dtype.name
+        settings = _SETTINGS[dtype]
+        bearable = (answer.status == Status.SOLVED) | (answer.status == Status.UNBOUNDED)
+        active = bearable & (grasps.margin <= answer.upper_bound * (1 + settings.tolerance))
+        # Without a load and disturbances no forces at all are the answer, exactly.
+        idle = active & (problem.rhs == 0).all((0, 1))
+        out = interior_point.solve(problem, settings, active & ~idle)
+        record = jax.tree.map(lambda v: jnp.where(idle, 0, v), out.record)
+        gap = (record.upper - record.lower) / problem.gap_scale(record)
+        status = jnp.select(
+            [~grasps.valid, bearable & ~active, ~bearable, gap <= _ACCEPTED[dtype]],
+            [Status.INVALID_INPUT, Status.INFEASIBLE, answer.status, Status.SOLVED],
+            Status.MAX_ITERATIONS,
+        ).astype(jnp.int32)
+        answered = active & jnp.isfinite(record.upper)
+        hide = lambda v: jnp.where(answered, v, jnp.nan)  # noqa: E731
+        forces = jnp.moveaxis(record.x * (shared.sizes * grasps.present)[:, :, None], (2, 1), (0, 1))
+        solution = TotalEffortSolution(
+            effort=hide(record.upper * unit),
+            lower_bound=hide(record.lower * unit),
+            forces=hide(forces[-1]),
+            changes=hide(forces[:-1] - forces[-1]),
+            status=status,
+            iterations=out.iterations,
+        )
+        return solution, record
+
+    def _adjoint(self, grasps: Grasps, held: tuple, cotangents: tuple, names: frozenset) -> Grasps:
+        solution, record = held
+        weight = jnp.where(jnp.isfinite(solution.effort), cotangents[0], 0)
+        record = jax.tree.map(lambda x: jnp.where(weight != 0, x, 0), record)
+
+        def value(grasps: Grasps) -> jax.Array:
+            problem, unit = _problem(grasps, basics(grasps, False), self.cone_edges, record.x)
+            return jnp.sum(weight * unit * problem.lagrangian(record))
+
+        return jax.grad(value, allow_int=True)(grasps)
+
+
+def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) -> tuple[ArrowProblem, jax.Array]:
+    """(11) in scaled forces, and the unit of effort."""
+    dtype, present = shared.sizes.dtype, grasps.present
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[..., None, None], (3, 3, *present.shape))
+
+    def scaled(blocks: jax.Array | None) -> jax.Array:
+        """D Q D."""
+        blocks = eye if blocks is None else blocks
+        return blocks * shared.sizes[:, None] * shared.sizes * present + eye * (1 - present)
+
+    own = scaled(None if grasps.weights is None else jnp.moveaxis(grasps.weights, 0, 2))
+    change = None
+    if grasps.half is not None:
+        inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.half, grasps.half)
+        change = jnp.moveaxis(jnp.linalg.inv(inverse), (0, -2, -1), (2, 0, 1))
+    change = scaled(change)
+    largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (own, change)])
+    unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
+    targets = jnp.concatenate([shared.load[:, None] - grasps.margin * shared.targets, shared.load[:, None]], 1)
+    patterns, h = patterns_of(pyramid_facets(cone_edges), dtype, 3)
+    problem = ArrowProblem(
+        patterns=patterns,
+        h=h,
+        columns=shared.columns[:, :, :, None],
+        rhs=targets,
+        dropped=shared.dropped[:, None],
+        own=(own / unit)[:, :, :, None],
+        change=(change / unit)[:, :, :, None],
+        guess=guess,
+    )
+    return problem, unit
