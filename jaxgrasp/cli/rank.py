@@ -59,6 +59,10 @@ class Rank:
     top: int = 10
     """How many of the best get tightening forces."""
 
+    prune: bool = False
+    """Give up grasps that cannot be among the best --top as soon as their bounds tell: the best are the same, sooner;
+    of the others the table has bounds."""
+
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Other metrics to have in the table, NAME[,NAME...]; the first one ranks. A wrong name is answered with all
     names."""
@@ -109,6 +113,8 @@ class Rank:
         for option, value, admissible, wanted in checks:
             if not admissible:
                 raise CommandError(f"{option}: got {value}; wanted {wanted}")
+        if self.prune and self.metric:
+            raise CommandError("--prune: got --metric, too; wanted a ranking by the margin alone")
         self.of_hand.check()
         if self.of_hand.scene and (self.files or self.gravity):
             what = "files of contacts" if self.files else "--gravity"
@@ -157,6 +163,7 @@ class Rank:
                     cone_edges=self.cone_edges,
                     share=self.share,
                     top=self.top,
+                    prune=self.prune,
                     metrics=metrics,
                     progress=progress,
                 )

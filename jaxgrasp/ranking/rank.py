@@ -34,9 +34,9 @@ class Ranking:
     """`Status` of (21)."""
 
     order: Int[np.ndarray, " batch"]
-    """Candidates, the best first: SOLVED and UNBOUNDED by falling margin, then MAX_ITERATIONS and ILL_CONDITIONED,
-    INFEASIBLE and INVALID_INPUT, each by falling margin with NaN last; equals by their number. With metrics: by the
-    first of them, the better ones first and NaN last."""
+    """Candidates, the best first: SOLVED and UNBOUNDED by falling margin, then MAX_ITERATIONS, ILL_CONDITIONED and
+    PRUNED, INFEASIBLE and INVALID_INPUT, each by falling margin with NaN last; equals by their number. With metrics:
+    by the first of them, the better ones first and NaN last."""
 
     share: float
     """The part of the margin that the tightening forces below are found for."""
@@ -88,6 +88,7 @@ def rank(
     cone_edges: int = 8,
     share: float = 0.75,
     top: int = 10,
+    prune: bool = False,
     metrics: Mapping[str, Float[np.ndarray, " batch"]] | None = None,
     tile: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -103,6 +104,8 @@ def rank(
         cone_edges: Edges of the friction pyramid, at least 3.
         share: The part of its margin, in (0, 1], for which the tightening forces of a candidate are found.
         top: How many of the best get tightening forces.
+        prune: Whether candidates that cannot be among the `top` are given up as soon as their bounds tell, with status
+            PRUNED; the `top` themselves are the same. Not together with `metrics`.
         metrics: Of all candidates, from `score`; where there are any, the first ranks in place of the margin.
         tile: Candidates at a time, at most; None chooses by platform.
         progress: Called after each tile of (21) with the number of candidates done.
@@ -111,7 +114,8 @@ def rank(
         The ranking.
 
     Raises:
-        ValueError: `share` is not in (0, 1], `top` is negative or a metric is unknown.
+        ValueError: `share` is not in (0, 1], `top` is negative, a metric is unknown, or metrics rank what is to be
+            pruned.
         RankingInterrupted: Ctrl-C or an error of the device; it holds what was ranked before.
 
     Status:
@@ -124,12 +128,19 @@ def rank(
     if disturbances is None:
         disturbances = DisturbanceSet.forces(1.0)
     check_metrics(list(metrics or {}))
+    if prune and metrics:
+        raise ValueError("prune: got metrics, too; wanted a ranking by the margin alone")
     scores = _Scores.none(len(candidates), dict(metrics or {}))
     columns = columns_of(candidates)
+    if prune:
+        columns["cutoff"] = np.full(len(candidates), -np.inf)
     settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": tile}
     try:
         for rows, answer in solve_in_tiles(margins, columns, disturbances, **settings):
             scores.fill(rows, *answer)
+            if prune and top:
+                # Read when the next tile is solved.
+                columns["cutoff"][rows.stop :] = scores.least_of_best(top)
             if progress is not None:
                 progress(scores.done)
         best = scores.order()[:top]
@@ -169,6 +180,11 @@ class _Scores:
         for code, last in _LAST.items():
             group[status == code] = last
         return np.lexsort((np.where(np.isnan(margin), np.inf, -margin), group))  # stable: equals stay in order
+
+    def least_of_best(self, top: int) -> float:
+        """What a candidate must reach to be among the best so far."""
+        best = self.margin[: self.done][np.isin(self.status[: self.done], _ANSWERED)]
+        return float(np.partition(best, len(best) - top)[len(best) - top]) if len(best) >= top else -np.inf
 
     def bearable(self, rows: np.ndarray) -> np.ndarray:
         # An infinite margin says that nothing disturbs the grasp: what remains to be asked is that it bears its load.

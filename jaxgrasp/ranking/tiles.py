@@ -96,9 +96,9 @@ def solve_in_tiles(
         yield slice(start, stop), jax.tree.map(lambda leaf, n=stop - start: np.asarray(leaf)[:n], answer)
 
 
-def margins(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str, Any], _: Any) -> Any:
-    """Solves (21): margin, upper bound, status."""
-    solution = largest_disturbance(contacts, disturbances, **task)
+def margins(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str, Any], columns: Any) -> Any:
+    """Solves (21): margin, upper bound, status; below the column `cutoff`, where there is one, not to the end."""
+    solution = largest_disturbance(contacts, disturbances, cutoff=columns.get("cutoff"), **task)
     return solution.margin, solution.upper_bound, solution.status
 
 
