@@ -121,9 +121,9 @@ def _dual(edges: Edges) -> QPSolution:
     mean = W.sum(-2) / _count(edges)[..., None]
     # Without any contact the row is zero, and the program infeasible.
     equality = jnp.concatenate([-mean, counted.any(-1)[..., None].astype(W.dtype)], -1)
-    cost = jnp.zeros((*edges.valid.shape, 7), W.dtype).at[..., 6].set(1)
+    cost = jnp.zeros(7, W.dtype).at[6].set(1)
     sides = jnp.where(counted, 0, 1).astype(W.dtype)
-    return solve_qp(None, cost, equality[..., None, :], jnp.ones((*edges.valid.shape, 1), W.dtype), rows, sides)
+    return solve_qp(None, cost, equality[..., None, :], jnp.ones(1, W.dtype), rows, sides)
 
 
 def _weight(edges: Edges, dual: QPSolution) -> jax.Array:

@@ -181,7 +181,7 @@ def solve_qp(
         INVALID_INPUT for data that are not finite, or P that is not positive semidefinite.
     """
     q = as_float("q", q, ("n",))
-    n, linear = q.shape[-1], P is None
+    n = q.shape[-1]
     P = jnp.zeros((n, n), q.dtype) if P is None else as_float("P", P, (n, n))
     rows = [*_pair("A", A, "b", b, n, q.dtype), *_pair("G", G, "h", h, n, q.dtype)]
     dtype = jnp.result_type(P, q, *rows)
@@ -191,18 +191,18 @@ def solve_qp(
     events = (2, 1, 2, 1, 2, 1)
     shapes = {name: v.shape[: v.ndim - k] for name, v, k in zip(Program._fields, program, events, strict=True)}
     batch = broadcast_batch(**shapes)
-    lanes = Program(
-        *(
-            jnp.broadcast_to(v, (*batch, *v.shape[v.ndim - k :]))
-            .reshape(math.prod(batch), *v.shape[v.ndim - k :])
-            .astype(dtype)
-            for v, k in zip(program, events, strict=True)
-        )
-    )
-    # One zero matrix for all: XLA would fold what it computes of a whole batch of them while it compiles, for seconds.
-    first = program.P.astype(dtype) if linear else lanes.P
-    solve = jax.vmap(lambda *data: _solve_one(Program(*data)), in_axes=(None if linear else 0, 0, 0, 0, 0, 0))
-    solution = solve(first, *lanes[1:])
+    # What all share stays one: XLA would fold what it computes of a batch of zeros while it compiles, for seconds.
+    shared = [bool(batch) and v.ndim == k for v, k in zip(program, events, strict=True)]
+    lanes = [
+        v.astype(dtype)
+        if alone
+        else jnp.broadcast_to(v, (*batch, *v.shape[v.ndim - k :]))
+        .reshape(math.prod(batch), *v.shape[v.ndim - k :])
+        .astype(dtype)
+        for v, k, alone in zip(program, events, shared, strict=True)
+    ]
+    solve = jax.vmap(lambda *data: _solve_one(Program(*data)), in_axes=tuple(None if alone else 0 for alone in shared))
+    solution = solve(*lanes)
     return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solution)
 
 
