@@ -112,7 +112,8 @@ def formulation_margin(
 
     Status:
         SOLVED; INFEASIBLE (no admissible f_0, for "per_direction" no f at all; margin NaN); UNBOUNDED (nothing
-        disturbs); MAX_ITERATIONS; INVALID_INPUT.
+        disturbs); MAX_ITERATIONS; INVALID_INPUT. As in `largest_disturbance`, a required wrench outside the range of G
+        is INFEASIBLE and a disturbance outside it makes the margin 0, also where one would cancel the other.
 
     Derivatives:
         Of margin, upper_bound and directions, first order, with respect to everything that is continuous (envelope
