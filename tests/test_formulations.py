@@ -174,7 +174,7 @@ def test_without_any_f_0_a_direction_may_still_be_withstood() -> None:
 
 def test_nine_implies_six_with_the_bound_that_trap_4_asks_for() -> None:
     batch = small()
-    vertices = jg.DisturbanceSet.vertices(0.5 * batch.wrenches)
+    vertices = jg.DisturbanceSet.vertices(0.1 * batch.wrenches)
     smaller = jg.Contacts.from_frames(
         batch.positions,
         batch.frames,
@@ -191,7 +191,7 @@ def test_nine_implies_six_with_the_bound_that_trap_4_asks_for() -> None:
     G = np.asarray(jg.grasp_map(contacts_of(batch)))[held]
     np.testing.assert_allclose(
         np.einsum("brc,bdc->bdr", G, np.asarray(nine.changes)[held].reshape(len(G), 6, -1)),
-        -0.5 * batch.wrenches[held],
+        -0.1 * batch.wrenches[held],
         atol=1e-6,
     )
     six_forces = np.asarray(six.forces)[np.asarray(six.status) == jg.Status.SOLVED]
@@ -260,7 +260,7 @@ def test_gradients_are_central_differences(name: str) -> None:
 
     at = np.asarray(margin(*data))
     some = jnp.asarray(np.isfinite(at) & (at > 1e-2))
-    assert some.mean() > 0.3
+    assert np.asarray(some).mean() > 0.3
     total = lambda *data: jnp.where(some, margin(*data), 0).sum()  # noqa: E731
     gradients = jax.grad(total, argnums=tuple(range(5)))(*data)
     rng = np.random.default_rng(0)
@@ -273,7 +273,7 @@ def test_gradients_are_central_differences(name: str) -> None:
         ours = np.asarray(jnp.sum((gradients[k] * along).reshape(len(batch), -1), -1))
         size = np.maximum(1, np.abs(central))
         smooth = np.asarray(some) & (bend <= 1e-2 * size)
-        assert smooth.sum() >= 0.8 * some.sum()
+        assert smooth.sum() >= 0.8 * np.asarray(some).sum()
         assert np.quantile(np.abs(ours - central)[smooth] / size[smooth], 0.9) <= GRADIENT_TOLERANCE
 
 

@@ -128,8 +128,13 @@ def _least(rows: list, h: np.ndarray, equal: list, case: Case) -> float:
 
 
 def per_direction(case: Case) -> float:
-    """The least over the directions of max lambda with G f = b - lambda W_j; nan where one is infeasible."""
+    """The least over the directions of max lambda with G f = b - lambda W_j; nan where one is infeasible.
+
+    A load outside the range of G counts as infeasible, even where a disturbance outside it would cancel that part.
+    """
     A, h = case.rows
+    if np.abs(case.b - case.G @ np.linalg.lstsq(case.G, case.b)[0]).max() > 1e-8 * max(np.abs(case.b).max(), 1e-300):
+        return np.nan
     rows = [np.hstack([A, np.zeros((len(A), 1))])] * len(case.W)
     return _least(rows, h, [np.hstack([case.G, w[:, None]]) for w in case.W], case)
 

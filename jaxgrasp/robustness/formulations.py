@@ -9,6 +9,7 @@ delta f_j is free or the blocking force (15).
 """
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Formulation, Scaled,
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along
 from jaxgrasp.solvers import embedding
-from jaxgrasp.solvers.conic_margin import ConicMargin, ConicPoint
+from jaxgrasp.solvers.conic_margin import ConicMargin
 from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.status import Status
 
@@ -112,7 +113,8 @@ def formulation_margin(
 
     Status:
         SOLVED; INFEASIBLE (no admissible f_0, for "per_direction" no f at all; margin NaN); UNBOUNDED (nothing
-        disturbs); MAX_ITERATIONS; INVALID_INPUT.
+        disturbs); MAX_ITERATIONS; INVALID_INPUT. As in `largest_disturbance`, a required wrench outside the range of G
+        is INFEASIBLE and a disturbance outside it makes the margin 0, also where one would cancel the other.
 
     Derivatives:
         Of margin, upper_bound and directions, first order, with respect to everything that is continuous (envelope
@@ -175,8 +177,8 @@ class Chain:
         changed = {}
         for name, (solution, point) in out.items():
             margin, directions = changes[name]
-            moved = {"margin": margin, "upper_bound": margin, "directions": directions}
-            still = ConicPoint(None, None, None, (None,) * len(point.z))
+            moved: dict[str, Any] = {"margin": margin, "upper_bound": margin, "directions": directions}
+            still = jax.tree.map(lambda _: None, point)
             changed[name] = FormulationSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), still
         return changed
 

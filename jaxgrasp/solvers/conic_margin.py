@@ -12,7 +12,7 @@ Callers scale: |x| <= 1 at admissible points with lambda >= 0, rows of E orthono
 """
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -148,13 +148,13 @@ def most(parts: Parts | list[jax.Array]) -> jax.Array:
     return fold(jnp.maximum, [reduce(jnp.maximum, v) for v in parts])
 
 
-def reduce(op: jnp.ufunc, v: jax.Array) -> jax.Array:
+def reduce(op: Any, v: jax.Array) -> jax.Array:
     """Over rows, copies and blocks, (d, J, n, *lanes) -> (*lanes)."""
     for _ in range(3):
         v = along(op, v)
     return v
 
 
-def along(op: jnp.ufunc, v: jax.Array) -> jax.Array:
+def along(op: Any, v: jax.Array) -> jax.Array:
     """Reduce the leading axis; spelt out while it is short, see `fold`."""
     return fold(op, v) if v.shape[0] <= _SPELT_OUT else op.reduce(v, axis=0)
