@@ -19,8 +19,8 @@ from jaxgrasp.kernels.rules import ELEMENTWISE, RULES
 
 # Loops of at most so many rounds are spelt out where a round depends on its number.
 _SPELT_OUT = 16
-# Kernels of more operations than this would compile for too long.
-_MOST_VALUES = 150_000
+# Entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
+_MOST_ENTRIES = 400_000
 
 
 @dataclass(eq=False)
@@ -81,6 +81,8 @@ def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
     floats |= {np.dtype(v.aval.dtype) for v in jaxpr.jaxpr.invars if kind_of(v.aval.dtype) == "f"}
     if len(floats) != 1 or not floats <= {np.dtype("float32"), np.dtype("float64")}:
         raise Unsupported(f"floating types {floats}")
+    if _entries(jaxpr.jaxpr) > _MOST_ENTRIES:
+        raise Unsupported("too many operations")
     lowering = _Lowering(Builder(floats.pop()))
     inputs = []
     for number, (var, is_shared) in enumerate(zip(jaxpr.jaxpr.invars, shared, strict=True)):
@@ -97,9 +99,20 @@ def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
     return Program(lowering.builder, avals(jaxpr.jaxpr.invars), shared, outputs, avals(jaxpr.jaxpr.outvars))
 
 
+def _entries(jaxpr: Jaxpr) -> int:
+    """Of all arrays that are computed, in loops once for each round that may be spelt out."""
+    total = 0
+    for eqn in jaxpr.eqns:
+        total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
+        length = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
+        inner = sum(_entries(j) for j in jax.core.jaxprs_in_params(eqn.params))
+        total += inner * (length if length <= _SPELT_OUT else 1)
+    return total
+
+
 class _Lowering:
     def __init__(self, builder: Builder) -> None:
-        self.builder, self.before = builder, Value.count
+        self.builder = builder
 
     def run(self, jaxpr: Jaxpr, consts: list[np.ndarray], args: list[np.ndarray]) -> list[np.ndarray]:
         """Evaluate."""
@@ -113,8 +126,6 @@ class _Lowering:
             for var, out in zip(eqn.outvars, outs, strict=True):
                 assert out.shape == tuple(var.aval.shape), (eqn, out.shape)
                 bound[var] = out
-            if Value.count - self.before > _MOST_VALUES:
-                raise Unsupported("too many operations")
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
