@@ -264,7 +264,8 @@ def test_gradients_are_central_differences(name: str) -> None:
     total = lambda *data: jnp.where(some, margin(*data), 0).sum()  # noqa: E731
     gradients = jax.grad(total, argnums=tuple(range(5)))(*data)
     rng = np.random.default_rng(0)
-    for k, step in enumerate((1e-6, 1e-4, 1e-4, 1e-4, 1e-4)):
+    step = 1e-6
+    for k in range(len(data)):
         along = jnp.asarray(rng.normal(size=data[k].shape))
         ends = [margin(*data[:k], data[k] + sign * step * along, *data[k + 1 :]) for sign in (1, 0, -1)]
         central = np.asarray(ends[0] - ends[2]) / (2 * step)

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
 
 from jaxgrasp.kernels.entries import array, kinds_of, known, objects
 from jaxgrasp.kernels.expressions import Builder, Region, Unsupported, Value, kind_of
@@ -105,7 +105,7 @@ def _entries(jaxpr: Jaxpr) -> int:
     for eqn in jaxpr.eqns:
         total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
         length = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
-        inner = sum(_entries(j) for j in jax.core.jaxprs_in_params(eqn.params))
+        inner = sum(_entries(j) for j in jaxprs_in_params(eqn.params))
         total += inner * (length if length <= _SPELT_OUT else 1)
     return total
 
