@@ -15,6 +15,7 @@ import pytest
 from jaxgrasp.candidates import sample_grasps
 from jaxgrasp.cli import main
 from jaxgrasp.cli import rank as rank_command
+from jaxgrasp.solvers.status import Status
 
 YCB = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "ycb_allegro_grasps.npz"
 
@@ -55,7 +56,7 @@ def test_prints_and_writes(here, capsys):
     assert main(["rank", str(path), "--gravity", "9.81", "--top", "8"]) == 0
     printed = capsys.readouterr().out
     assert "grasps.npz:" in printed and "a [bold] box" in printed and "margin [N]" in printed
-    counts = [int(number) for number in re.findall(r"(\d+) [A-Z_]{6,}", printed)][-6:]
+    counts = [int(number) for number in re.findall(r"(\d+) [A-Z_]{6,}", printed)][-len(Status) :]
     assert sum(counts) == 24 and "0 INVALID_INPUT" in printed
     assert "written: ranking.parquet, ranking.png" in printed
     table = pyarrow.parquet.read_table("ranking.parquet")

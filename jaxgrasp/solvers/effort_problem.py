@@ -89,7 +89,8 @@ class EffortProblem(BlockProblem):
     def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
         """Both bounds.
 
-        What a point misses the rows by is charged at the rows' multipliers, so that no effort is saved by it.
+        What a point misses the rows by is charged at the rows' multipliers, twice: what it saves, and as much again, so
+        that the effort itself, too, is within the bounds' distance of the least.
         """
         x = fenced(self.project)(iterate.x)
 
@@ -101,7 +102,7 @@ class EffortProblem(BlockProblem):
         missed = fold(jnp.maximum, [-least(-o) for o in over])
         charge = fold(jnp.add, [total(o * z) for o, z in zip(over, iterate.z, strict=True)])
         near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
-        upper = jnp.where(missed <= near, value(x) + charge, jnp.inf)
+        upper = jnp.where(missed <= near, value(x) + 2 * charge, jnp.inf)
         held = fold(jnp.add, [total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
         lost = fold(jnp.add, [total(jnp.abs(d)) for d in residuals.dual])
         lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - lost
