@@ -17,8 +17,8 @@ from jaxgrasp.kernels.entries import array, kinds_of, known, objects
 from jaxgrasp.kernels.expressions import Builder, Region, Unsupported, Value, kind_of
 from jaxgrasp.kernels.rules import ELEMENTWISE, RULES
 
-# Loops of at most so many rounds are spelt out where a round depends on its number.
-_SPELT_OUT = 16
+# Loops of at most so many rounds are spelt out where a round depends on its number, and where each leaves a result.
+_SPELT_OUT, _STACKED = 16, 64
 # Entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
 _MOST_ENTRIES = 400_000
 
@@ -106,7 +106,7 @@ def _entries(jaxpr: Jaxpr) -> int:
         total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
         length = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
         inner = sum(_entries(j) for j in jaxprs_in_params(eqn.params))
-        total += inner * (length if length <= _SPELT_OUT else 1)
+        total += inner * (length if length <= _STACKED else 1)
     return total
 
 
@@ -170,7 +170,8 @@ class _Lowering:
         inner = [np.asarray(c) for c in body.consts]
         n_ys = len(body.jaxpr.outvars) - n_carry
         counters = _counters(body.jaxpr, n_consts, n_carry, carry)
-        if length <= _SPELT_OUT and (xs or n_ys or any(used for _, used in counters.values())) or length == 1:
+        numbered = xs or any(used for _, used in counters.values())
+        if length == 1 or (numbered and length <= _SPELT_OUT) or (n_ys and length <= _STACKED):
             rows: list[list[np.ndarray]] = [[] for _ in range(n_ys)]
             for i in range(length):
                 at = length - 1 - i if reverse else i
