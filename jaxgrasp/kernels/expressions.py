@@ -10,9 +10,6 @@ from typing import Any
 
 import numpy as np
 
-Constant = np.floating | np.integer | np.bool_
-Scalar = "Value | Constant"
-
 
 class Region:
     """Code that runs as a whole: a kernel, the body of a loop, or what only some problems need.
