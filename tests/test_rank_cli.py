@@ -190,7 +190,8 @@ def test_help_is_quick_and_loads_nothing_heavy():
 def test_interrupted_it_keeps_what_it_has(here):
     path = write_candidates(here / "grasps.npz", count=200_000)
     program = (
-        "import sys, time; from jaxgrasp.ranking import tiles; tiles.TILE['cpu'] = 1024; from jaxgrasp.cli import main\n"
+        "import sys, time; from jaxgrasp.cli import main\n"
+        "from jaxgrasp.ranking import tiles; tiles.TILE['cpu'] = 1024\n"
         "from jaxgrasp.cli import report; tick = report.Clock.tick\n"
         # All of it would take half a second otherwise, which a busy machine may need to send the signal.
         "def shown(self, done): tick(self, done); print(done, flush=True); time.sleep(0.02)\n"
