@@ -24,6 +24,9 @@ from jaxgrasp.kernels import machine, native
 SAME_MARGIN = {"float64": 2e-8, "float32": 1e-4}
 """Of max(|margin|, Lambda). In float32 both may be off by what the method accepts."""
 
+STALLED = 3e-4
+"""Of max(|margin|, Lambda): gaps that float32's rounding holds open near the accepted one, which some pass by luck."""
+
 ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 """Relative, for short functions: reciprocals are good to a unit or two in the last place."""
 
@@ -175,12 +178,19 @@ def test_the_same_margins_as_on_xla(name, precision):
     S_1, S_2 = jg.worst_case(*data[:2], cone_edges=edges)
     units = jnp.where(group.batch.active, data[0].max_force, 1), jnp.where(group.batch.active, data[0].friction, 1)
     largest = jnp.maximum((-S_1.min(-1) / jnp.maximum(units[1], 1e-6) / units[0]).max(-1), (S_2 / units[0]).max(-1))
-    unit = np.maximum(np.abs(theirs.margin), 1 / np.asarray(largest))
+    margin, upper = np.fmax(ours.margin, theirs.margin), np.stack([ours.upper_bound, theirs.upper_bound])
+    unit = np.maximum(np.abs(margin), 1 / np.asarray(largest))
     same = ours.status == theirs.status
     assert same.all() if precision == "float64" else same.mean() > 0.999
     known = np.isfinite(ours.margin) & np.isfinite(theirs.margin)
     assert (np.abs(ours.margin - theirs.margin)[known] <= (SAME_MARGIN[precision] * unit)[known]).all()
-    assert (np.isnan(ours.margin) == np.isnan(theirs.margin))[same].all()
+    only_one = (np.isnan(ours.margin) != np.isnan(theirs.margin)) & same
+    if precision == "float64":
+        assert not only_one.any()
+    # Of a load that cannot be borne float32 may prove just that, or close the gap too; the bounds then tell the same.
+    assert only_one.mean() < 0.001 and (ours.status == jg.Status.INFEASIBLE)[only_one].all()
+    assert (upper < 0)[:, only_one].all()
+    assert ((margin - 1e-5 * unit <= upper) & (upper <= margin + STALLED * unit))[:, only_one].all()
 
 
 def grasps(count: int):
