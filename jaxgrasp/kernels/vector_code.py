@@ -174,7 +174,7 @@ class VectorCode(Instructions):
     def store_where(self, mask: str | None, new: str, slot: str, kind: str) -> None:
         """Put a vector in memory, where the mask holds."""
         vector = self.types[kind]
-        if mask is not None and kind == "b":
+        if mask is not None:
             old = self.load(kind, slot)
             new, mask = self.emit(f"select {self.types['b']} {mask}, {vector} {new}, {vector} {old}"), None
         if mask is None:
