@@ -103,9 +103,9 @@ def watched() -> Iterator[list]:
     seen: list = []
     target = native.target
 
-    def watching(jaxpr, shared):
-        seen.append((jaxpr, shared))
-        return target(jaxpr, shared)
+    def watching(plan):
+        seen.append((plan.trace(), plan.shared))
+        return target(plan)
 
     native.target = watching
     try:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -48,8 +49,9 @@ class DisturbanceSet:
             magnitude: (*batch,), N.
         """
         size = as_float("magnitude", magnitude, ())
-        axes = jnp.eye(3, 6, dtype=size.dtype)
-        return cls(terms=(Vertices(wrenches=size[..., None, None] * jnp.concatenate([axes, -axes])),))
+        # NumPy's, since every operation of JAX's outside a program is a program of its own.
+        axes = np.eye(3, 6, dtype=size.dtype)
+        return cls(terms=(Vertices(wrenches=size[..., None, None] * np.concatenate([axes, -axes])),))
 
     @classmethod
     def box(cls, half_extents: ArrayLike) -> "DisturbanceSet":

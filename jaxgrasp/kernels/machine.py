@@ -123,7 +123,7 @@ def capsule(address: int) -> Any:
 
 
 def cached(key: str) -> bytes | None:
-    """Object code that was kept, if it is whole; what others could have written is not trusted."""
+    """What was kept, if it is whole; what others could have written is not trusted."""
     try:
         folder = _folder()
         own = folder.stat()
@@ -132,12 +132,12 @@ def cached(key: str) -> bytes | None:
         content = (folder / key).read_bytes()
     except OSError:
         return None
-    digest, objects = content[:32], content[32:]
-    return objects if hashlib.sha256(objects).digest() == digest else None
+    digest, rest = content[:32], content[32:]
+    return rest if hashlib.sha256(rest).digest() == digest else None
 
 
-def keep(key: str, objects: bytes) -> None:
-    """Keep object code.
+def keep(key: str, content: bytes) -> None:
+    """Keep object code, or what is known of a program.
 
     Raises:
         OSError: the folder cannot be written.
@@ -145,7 +145,7 @@ def keep(key: str, objects: bytes) -> None:
     folder = _folder()
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-        file.write(hashlib.sha256(objects).digest() + objects)
+        file.write(hashlib.sha256(content).digest() + content)
     os.replace(file.name, folder / key)
 
 

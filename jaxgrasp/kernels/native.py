@@ -9,22 +9,22 @@ import contextlib
 import contextvars
 import functools
 import gc
-import hashlib
 import os
+import pickle
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive
+from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import mlir
 
 from jaxgrasp.fence import loops
-from jaxgrasp.kernels import cpu, machine
+from jaxgrasp.kernels import cpu, fingerprint, machine
 from jaxgrasp.kernels.expressions import Unsupported
 from jaxgrasp.kernels.lowering import lowered
 from jaxgrasp.kernels.machine import Unavailable
@@ -50,6 +50,7 @@ def fused(
     leaves: list[jax.Array],
     shared: tuple[bool, ...],
     otherwise: Callable[[list[jax.Array]], Tree],
+    known_as: str | None = None,
 ) -> Tree:
     """Run a function over the leading axis of its arguments.
 
@@ -58,20 +59,68 @@ def fused(
         leaves: (problems, ...), or without the leading axis where shared.
         shared: for every leaf.
         otherwise: the same function of `leaves`, for XLA, where there is no fused kernel.
+        known_as: what tells the function from all others that this package's code can make of the same arguments; it is
+            then not even traced where its kernel is on disk. None where nothing does.
     """
     if not _allowed.get() or not usable():
         return otherwise(leaves)
     problems = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
     events = [x.shape if s else x.shape[1:] for x, s in zip(leaves, shared, strict=True)]
     given = [jax.ShapeDtypeStruct((*e, 1), x.dtype) for e, x in zip(events, leaves, strict=True)]
-    with loops():
-        jaxpr, out = jax.make_jaxpr(function, return_shape=True)(given)
-    wanted, structure = jax.tree.flatten(out)
+    plan = _planned(function, given, shared, known_as)
+    wanted, structure = jax.tree.flatten(plan.out)
     shapes = tuple(jax.core.ShapedArray((problems, *x.shape[:-1]), x.dtype) for x in wanted)
     flat = lambda *leaves: jax.tree.leaves(otherwise(list(leaves)))  # noqa: E731
-    return jax.tree.unflatten(
-        structure, _fused_p.bind(*leaves, jaxpr=jaxpr, shared=shared, shapes=shapes, otherwise=flat)
-    )
+    return jax.tree.unflatten(structure, _fused_p.bind(*leaves, plan=plan, shapes=shapes, otherwise=flat))
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A program, which may not have been traced yet.
+
+    key: its name among compiled kernels.
+    out: arrays like its results, one trailing axis of size 1.
+    trace: makes its jaxpr.
+    shared: for every argument, whether all problems share it.
+    """
+
+    key: str
+    out: Tree
+    trace: Callable[[], ClosedJaxpr]
+    shared: tuple[bool, ...]
+
+
+_origins: dict[str, tuple[str, Tree]] = {}
+
+
+def _planned(
+    function: Callable[[list[jax.Array]], Tree],
+    given: list[jax.ShapeDtypeStruct],
+    shared: tuple[bool, ...],
+    known_as: str | None,
+) -> Plan:
+    @functools.cache
+    def traced() -> tuple[ClosedJaxpr, Tree]:
+        with loops():
+            return jax.make_jaxpr(function, return_shape=True)(given)
+
+    def look() -> tuple[str, Tree]:
+        jaxpr, out = traced()
+        return fingerprint.of_program(jaxpr, shared), jax.tree.map(lambda x: np.empty(x.shape, x.dtype), out)
+
+    def trace() -> ClosedJaxpr:
+        return traced()[0]
+
+    if known_as is None:
+        return Plan(*look(), trace, shared)
+    origin = fingerprint.of_origin(known_as, given, shared)
+    if origin not in _origins:
+        # Whoever can write this could write the kernels, too.
+        kept = machine.cached(origin)
+        _origins[origin] = pickle.loads(kept) if kept is not None else look()
+        if kept is None:
+            _keep(origin, pickle.dumps(_origins[origin]))
+    return Plan(*_origins[origin], trace, shared)
 
 
 # A primitive, so that kernels whose results nobody uses are never compiled.
@@ -81,9 +130,9 @@ _fused_p.def_impl(lambda *leaves, **params: jax.jit(functools.partial(_fused_p.b
 _fused_p.def_abstract_eval(lambda *_, shapes, **__: list(shapes))
 
 
-def _lower(ctx: Any, *leaves: Any, jaxpr: ClosedJaxpr, shared: Any, shapes: Any, otherwise: Any) -> Any:
+def _lower(ctx: Any, *leaves: Any, plan: Plan, shapes: Any, otherwise: Any) -> Any:
     try:
-        name = target(jaxpr, shared)
+        name = target(plan)
     except Unsupported:
         return mlir.lower_fun(otherwise, multiple_results=True)(ctx, *leaves)
     return jax.ffi.ffi_lowering(name)(ctx, *leaves)
@@ -109,8 +158,7 @@ def _works() -> bool:
         machine.machine()
         start = np.arange(3, dtype=np.float32)
         with _lock:
-            jaxpr = jax.make_jaxpr(lambda x: x + 1)(jax.ShapeDtypeStruct((1,), np.float32))
-            name = target(jaxpr, (False,))
+            name = target(_planned(lambda x: x[0] + 1, [jax.ShapeDtypeStruct((1,), np.float32)], (False,), None))
         with jax.ensure_compile_time_eval():
             out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(jnp.asarray(start))
         if not np.array_equal(np.asarray(out), start + 1):
@@ -139,34 +187,33 @@ def _tell(why: str) -> None:
 _known: dict[str, str | None] = {}
 
 
-def target(jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
+def target(plan: Plan) -> str:
     """The name under which XLA knows a kernel; compiled, or read from disk, where it is new.
 
     Raises:
         Unsupported: there is none.
     """
-    key = _fingerprint(jaxpr, shared)
     with _lock:
-        if key not in _known:
+        if plan.key not in _known:
             try:
-                _known[key] = _registered(key, jaxpr, shared)
+                _known[plan.key] = _registered(plan)
             except Unsupported:
-                _known[key] = None
-        name = _known[key]
+                _known[plan.key] = None
+        name = _known[plan.key]
     if name is None:
         raise Unsupported
     return name
 
 
-def _registered(key: str, jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
-    at, name = machine.machine(), f"jaxgrasp_{key[:32]}"
-    objects = machine.cached(key)
+def _registered(plan: Plan) -> str:
+    at, name = machine.machine(), f"jaxgrasp_{plan.key[:32]}"
+    objects = machine.cached(plan.key)
     if objects is None:
         # A hundred thousand small objects, and no garbage among them.
         collecting = gc.isenabled()
         gc.disable()
         try:
-            program = lowered(jaxpr, list(shared))
+            program = lowered(plan.trace(), list(plan.shared))
             width = at.vector_bytes // program.builder.dtype.itemsize
             objects = machine.compiled(cpu.module(program, name, width, estimates=at.estimates))
         except RuntimeError as error:
@@ -175,12 +222,16 @@ def _registered(key: str, jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
         finally:
             if collecting:
                 gc.enable()
-        try:
-            machine.keep(key, objects)
-        except OSError as error:
-            _tell_of_disk(str(error))
+        _keep(plan.key, objects)
     jax.ffi.register_ffi_target(name, machine.capsule(machine.loaded(objects, name)), platform="cpu")
     return name
+
+
+def _keep(key: str, content: bytes) -> None:
+    try:
+        machine.keep(key, content)
+    except OSError as error:
+        _tell_of_disk(str(error))
 
 
 @functools.cache
@@ -190,64 +241,3 @@ def _tell_of_disk(why: str) -> None:
         RuntimeWarning,
         stacklevel=2,
     )
-
-
-@functools.cache
-def _source() -> str:
-    """Changes whenever this room does, and with it what is compiled."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-
-
-def _fingerprint(jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
-    """The same for programs that are the same, in any process on any machine of this kind."""
-    digest = hashlib.sha256(f"{_source()} {machine.machine().description} {shared}".encode())
-    numbers: dict[Any, int] = {}
-
-    def name(v: Any) -> str:
-        if isinstance(v, Literal):
-            return f"{v.val!r}:{v.aval.dtype}"
-        return str(numbers.setdefault(v, len(numbers)))
-
-    def plain(value: Any) -> str:
-        if isinstance(value, ClosedJaxpr):
-            for const in value.consts:
-                constant(const)
-            walk(value.jaxpr)
-            return "closed"
-        if isinstance(value, Jaxpr):
-            walk(value)
-            return "open"
-        if isinstance(value, tuple | list):
-            return ",".join(map(plain, value))
-        return getattr(value, "__name__", None) or "" if callable(value) else repr(value)
-
-    def constant(const: Any) -> None:
-        array = np.asarray(const)
-        digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
-
-    def walk(inner: Jaxpr) -> None:
-        for v in (*inner.constvars, *inner.invars):
-            digest.update(f"{name(v)}={v.aval.dtype}{v.aval.shape};".encode())
-        for eqn in inner.eqns:
-            # What only matters to XLA, and may differ between traces of the same program.
-            params = {k: v for k, v in eqn.params.items() if k not in _INCIDENTAL}
-            said = [eqn.primitive.name, *map(name, eqn.invars), *[f"{k}={plain(v)}" for k, v in params.items()]]
-            outs = [f"{name(v)}={v.aval.dtype}{v.aval.shape}" for v in eqn.outvars]
-            digest.update((" ".join([*said, *outs]) + "\n").encode())
-        digest.update(("->" + ",".join(map(name, inner.outvars))).encode())
-
-    plain(jaxpr)
-    return digest.hexdigest()
-
-
-_INCIDENTAL = {"name", "jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "ctx_mesh", "donated_invars"}
-_INCIDENTAL |= {
-    "compiler_options_kvs",
-    "in_shardings",
-    "out_shardings",
-    "in_layouts",
-    "out_layouts",
-    "sharding",
-    "out_sharding",
-}

@@ -174,7 +174,7 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
         # The equality rows are what is largest; up to twice as many values were seen to compile.
         joints, actuators = given["actuation"].transmission.shape[-2:]
         rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
-    lanes = Lanes(admit, shared, rows, compact, kernel.tile or LOOSE_TILE)
+    lanes = Lanes(admit, shared, rows, compact, kernel.tile or LOOSE_TILE, str(structure))
     out = differentiable(kernel, lanes, arguments)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 

@@ -30,6 +30,7 @@ class Lanes:
     rows: how many rows a lane has, which sets the size of a tile.
     compact: whether a tile can be one function, see `map_lanes`.
     tile: lanes of a tile that cannot.
+    known_as: tells `admit` from all others that take arguments of the same names and shapes.
     """
 
     admit: Callable[[Raw], Any]
@@ -37,6 +38,7 @@ class Lanes:
     rows: int
     compact: bool
     tile: int
+    known_as: str
 
 
 class Kernel(Protocol):
@@ -166,7 +168,17 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()
 
         shared = (lanes.shared, jax.tree.map(lambda _: False, held))
         stages = (enter, *kernel.stages[1:])
-        return map_lanes(stages, (arguments, held), shared, lanes.rows, compact=lanes.compact, tile=lanes.tile)
+        # Kernels have no state but their fields, which are numbers and names.
+        known_as = f"{type(kernel).__module__}.{type(kernel).__qualname__} {vars(kernel)} {lanes.known_as}"
+        return map_lanes(
+            stages,
+            (arguments, held),
+            shared,
+            lanes.rows,
+            compact=lanes.compact,
+            tile=lanes.tile,
+            known_as=known_as,
+        )
 
     @partial(value.defjvp, symbolic_zeros=True)
     def derivative(primals: tuple, dots: tuple) -> tuple[Tree, Tree]:

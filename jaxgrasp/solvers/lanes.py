@@ -37,6 +37,7 @@ def map_lanes(
     *,
     compact: bool,
     tile: int = LOOSE_TILE,
+    known_as: str | None = None,
 ) -> Tree:
     """Run a kernel over the leading axis of its arguments.
 
@@ -49,30 +50,31 @@ def map_lanes(
             on CPUs.
         rows: how many rows a lane has, which sets the size of a tile.
         tile: how many lanes a tile has where it cannot be one function.
+        known_as: tells the kernel from all others, see `kernels.fused`.
 
     Returns:
         What the last stage returns, leaves (lanes, ...).
     """
     leaves, structure = jax.tree.flatten(arguments)
+    flags, rows = tuple(jax.tree.leaves(shared)), rows if compact else 0
     if any(x.size == 0 for x in leaves):
-        one = [
-            x if s else jnp.zeros((1, *x.shape[1:]), x.dtype)
-            for x, s in zip(leaves, jax.tree.leaves(shared), strict=True)
-        ]
-        shapes = jax.eval_shape(_run(stages, structure, tuple(jax.tree.leaves(shared)), 0, tile), one)
+        one = [x if s else jnp.zeros((1, *x.shape[1:]), x.dtype) for x, s in zip(leaves, flags, strict=True)]
+        shapes = jax.eval_shape(_run(stages, structure, flags, 0, tile, None), one)
         return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), shapes)
-    return _run(stages, structure, tuple(jax.tree.leaves(shared)), rows if compact else 0, tile)(leaves)
+    return _run(stages, structure, flags, rows, tile, known_as and f"{known_as} {structure}")(leaves)
 
 
-def _run(stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int, tile: int) -> Callable:
+def _run(
+    stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int, tile: int, known_as: str | None
+) -> Callable:
     @custom_vmap
     def run(leaves: list[jax.Array]) -> Tree:
-        return tiled(stages, structure, shared, rows, leaves, tile)
+        return tiled(stages, structure, shared, rows, leaves, tile, known_as)
 
     @run.def_vmap
     def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
         merged, still_shared, lanes = merged_axes(leaves, batched[0], shared, size)
-        out = _run(stages, structure, still_shared, rows, tile)(merged)
+        out = _run(stages, structure, still_shared, rows, tile, known_as)(merged)
         out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
@@ -111,6 +113,7 @@ def tiled(
     rows: int,
     leaves: list[jax.Array],
     loose: int = LOOSE_TILE,
+    known_as: str | None = None,
 ) -> Tree:
     """`map_lanes` of leaves, without a rule for `jax.vmap`; rows are 0 where tiles cannot be compact."""
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
@@ -144,7 +147,7 @@ def tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def on_cpu() -> Tree:
-        return fused(partial(_in_turn, (first, *stages[1:])), leaves, shared, in_compact_tiles)
+        return fused(partial(_in_turn, (first, *stages[1:])), leaves, shared, in_compact_tiles, known_as)
 
     def in_compact_tiles(leaves: list[jax.Array]) -> Tree:
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
