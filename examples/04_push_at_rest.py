@@ -12,7 +12,8 @@ jax.config.update("jax_enable_x64", True)
 
 import jaxgrasp as jg  # noqa: E402
 from jaxgrasp.simulation import ComputedTorque, ForceOptimization, Push, Run, Simulator, torque_hand  # noqa: E402
-from jaxgrasp.viewer import figure_of_pushes, write_figure, write_movie  # noqa: E402
+from jaxgrasp.viewer import figure_of_pushes, write_figure  # noqa: E402
+from jaxgrasp.viewer.movie import write_movie  # noqa: E402
 
 BEGIN, SECONDS = 0.1, 0.4
 NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")

@@ -17,7 +17,8 @@ from jaxgrasp.simulation import ComputedTorque, ForceOptimization, JointSprings,
 from jaxgrasp.simulation.control import Impedance, Wanted, goal_of
 from jaxgrasp.simulation.simulator import _rotation_vectors, _rotations
 from jaxgrasp.simulation.state import measure
-from jaxgrasp.viewer import figure_of_motions, figure_of_pushes, write_movie
+from jaxgrasp.viewer import figure_of_motions, figure_of_pushes
+from jaxgrasp.viewer.movie import write_movie
 
 ROUNDING = 1e-12
 EIGHT_EDGES = np.cos(np.pi / 8)

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
@@ -14,7 +15,9 @@ from rich.table import Table
 
 from jaxgrasp.ranking import MetricComparison, Ranking
 from jaxgrasp.solvers.status import Status
-from jaxgrasp.synthesis import Record, Synthesis
+
+if TYPE_CHECKING:
+    from jaxgrasp.synthesis import Record, Synthesis
 
 _ROWS = 20
 _TEXT_COLUMNS = 2
@@ -84,7 +87,7 @@ def counting_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
-def ascent_bar(steps: int) -> Iterator[Callable[[int, Record], None]]:
+def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
     """Shows a bar on standard error where that is a terminal, with the median and the best margin so far.
 
     Args:
@@ -98,14 +101,14 @@ def ascent_bar(steps: int) -> Iterator[Callable[[int, Record], None]]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("compiling", total=steps)
 
-        def show(done: int, record: Record) -> None:
+        def show(done: int, record: "Record") -> None:
             text = f"margin: median {record.median[-1]:.3g}, best {record.best[-1]:.3g}"
             progress.update(task, completed=done, description=text)
 
         yield show
 
 
-def print_synthesis(found: Synthesis, name: str, note: str, unit: str, written: Sequence[Path]) -> None:
+def print_synthesis(found: "Synthesis", name: str, note: str, unit: str, written: Sequence[Path]) -> None:
     """Prints what a synthesis found to standard output.
 
     Args:

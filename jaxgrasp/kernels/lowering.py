@@ -171,7 +171,7 @@ class _Lowering:
         n_ys = len(body.jaxpr.outvars) - n_carry
         counters = _counters(body.jaxpr, n_consts, n_carry, carry)
         numbered = xs or any(used for _, used in counters.values())
-        if length == 1 or (numbered and length <= _SPELT_OUT) or (n_ys and length <= _STACKED):
+        if length <= 2 or (numbered and length <= _SPELT_OUT) or (n_ys and length <= _STACKED):
             rows: list[list[np.ndarray]] = [[] for _ in range(n_ys)]
             for i in range(length):
                 at = length - 1 - i if reverse else i

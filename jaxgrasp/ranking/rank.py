@@ -143,12 +143,13 @@ def rank(
                 columns["cutoff"][rows.stop :] = scores.least_of_best(top)
             if progress is not None:
                 progress(scores.done)
-        best = scores.order()[:top]
+        order = scores.order()
+        best = order[:top]
         columns = {name: column[best] for name, column in columns.items()} | {"wanted": share * scores.bearable(best)}
         answers = [answer for _, answer in solve_in_tiles(tightening, columns, disturbances, **settings)]
     except (KeyboardInterrupt, RuntimeError, MemoryError) as reason:
-        raise RankingInterrupted(scores.ranking(candidates, share, [])) from reason
-    return scores.ranking(candidates, share, answers)
+        raise RankingInterrupted(scores.ranking(candidates, scores.order(), share, [])) from reason
+    return scores.ranking(candidates, order, share, answers)
 
 
 @dataclass(kw_only=True)
@@ -191,7 +192,9 @@ class _Scores:
         margin = np.where(self.status[rows] == Status.UNBOUNDED, 0.0, np.maximum(self.margin[rows], 0.0))
         return np.where(np.isin(self.status[rows], _ANSWERED), margin, np.nan)
 
-    def ranking(self, candidates: Candidates, share: float, answers: list[tuple[np.ndarray, ...]]) -> Ranking:
+    def ranking(
+        self, candidates: Candidates, order: np.ndarray, share: float, answers: list[tuple[np.ndarray, ...]]
+    ) -> Ranking:
         empty, actuators = np.empty((0, candidates.num_contacts, 3)), candidates.hand.get("lower", np.empty((0, 0)))
         answers = [(empty, empty, np.empty(0), np.empty(0, dtype=int), actuators[:0]), *answers]
         forces, object_forces, effort, tightening_status, controls = map(np.concatenate, zip(*answers, strict=True))
@@ -200,7 +203,7 @@ class _Scores:
             margin=self.margin[: self.done],
             upper_bound=self.upper_bound[: self.done],
             status=self.status[: self.done],
-            order=self.order(),
+            order=order,
             share=share,
             forces=forces,
             object_forces=object_forces,

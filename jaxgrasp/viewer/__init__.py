@@ -1,8 +1,10 @@
-"""Figures of grasps and rankings, made with matplotlib and no window."""
+"""Figures of grasps and rankings, made with matplotlib and no window.
+
+What renders with MuJoCo, which takes long to import, is in `movie` and `scene`.
+"""
 
 from jaxgrasp.viewer.comparison import figure_of_comparison
 from jaxgrasp.viewer.grasp import draw_grasp
-from jaxgrasp.viewer.movie import write_movie
 from jaxgrasp.viewer.ranking import figure_of_ranking, write_figure
 from jaxgrasp.viewer.simulation import figure_of_motions, figure_of_pushes
 from jaxgrasp.viewer.synthesis import figure_of_synthesis
@@ -15,5 +17,4 @@ __all__ = [
     "figure_of_ranking",
     "figure_of_synthesis",
     "write_figure",
-    "write_movie",
 ]

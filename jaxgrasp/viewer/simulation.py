@@ -1,19 +1,22 @@
 """Figures of simulated hands that are pushed, like figures 3 to 5 of the paper."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxgrasp.simulation import Run
 from jaxgrasp.viewer.grasp import CONTACT_COLOURS
+
+if TYPE_CHECKING:
+    from jaxgrasp.simulation import Run
 
 # mm; what is farther away was lost.
 _FARTHEST = 12.0
 
 
-def figure_of_pushes(runs: Mapping[str, Run], labels: Sequence[str]) -> Figure:
+def figure_of_pushes(runs: "Mapping[str, Run]", labels: Sequence[str]) -> Figure:
     """How far each push moves the object, and how hard the weakest finger still presses; one column a run.
 
     Args:
@@ -37,7 +40,7 @@ def figure_of_pushes(runs: Mapping[str, Run], labels: Sequence[str]) -> Figure:
     return figure
 
 
-def figure_of_motions(runs: Mapping[str, Run], labels: Sequence[str]) -> Figure:
+def figure_of_motions(runs: "Mapping[str, Run]", labels: Sequence[str]) -> Figure:
     """The object's path and the normal forces of all fingers in the first lane; one column a run.
 
     Args:
@@ -65,7 +68,7 @@ def figure_of_motions(runs: Mapping[str, Run], labels: Sequence[str]) -> Figure:
     return figure
 
 
-def _mark(axes: Axes, run: Run) -> None:
+def _mark(axes: Axes, run: "Run") -> None:
     axes.axvspan(run.push.begin, run.push.begin + run.push.duration, color="0.9", zorder=0)
     axes.grid(alpha=0.25)
     axes.tick_params(labelsize=8)

@@ -1,17 +1,21 @@
 """The figure of a synthesis: how the margins grew, and what the best grasps look like."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from jaxgrasp.synthesis import Synthesis
 from jaxgrasp.viewer.grasp import draw_grasp
+
+if TYPE_CHECKING:
+    from jaxgrasp.synthesis import Synthesis
 
 
 def figure_of_synthesis(
-    found: Synthesis,
+    found: "Synthesis",
     surface: Float[np.ndarray, "points 3"],
     *,
     friction: float,
@@ -57,7 +61,7 @@ def figure_of_synthesis(
     return figure
 
 
-def _draw_ascent(axes: Axes, found: Synthesis, unit: str) -> None:
+def _draw_ascent(axes: Axes, found: "Synthesis", unit: str) -> None:
     record = found.record
     steps = np.arange(1, len(record.best) + 1)
     finite = [np.where(np.isfinite(row), row, np.nan) for row in (record.best, record.median, record.lowest_tenth)]
@@ -72,7 +76,7 @@ def _draw_ascent(axes: Axes, found: Synthesis, unit: str) -> None:
     axes.legend(frameon=False, fontsize=8, loc="lower right")
 
 
-def _draw_distribution(axes: Axes, found: Synthesis, unit: str) -> None:
+def _draw_distribution(axes: Axes, found: "Synthesis", unit: str) -> None:
     before, after = (np.maximum(np.nan_to_num(margin, nan=0.0), 0.0) for margin in (found.first_margin, found.margin))
     edges = np.linspace(0.0, max(float(after.max()), float(before.max()), 1e-9), 41)
     axes.hist(before, bins=edges, color="0.75", label="random starts")
