@@ -11,6 +11,7 @@ from typing import Any
 
 from jaxgrasp.kernels.expressions import Region, Value
 from jaxgrasp.kernels.lowering import Guard, Loop, Program
+from jaxgrasp.kernels.sums import chain_sums
 
 Step = Loop | Guard
 
@@ -51,13 +52,56 @@ def in_memory(value: Value) -> bool:
 def scheduled(program: Program) -> Schedule:
     """Put a program in order."""
     results = [x for out in program.outputs for x in out.flat]
-    order = _Order(_products(program.builder.region, results))
+    chain_sums(*_used(program.builder.region, results))
+    order = _Order(_products(*_used(program.builder.region, results)))
     order.region(program.builder.region, results)
     for number, value in enumerate(results):
         order.events.append(Event("store", number, _values([value])))
-    schedule = Schedule(order.events, order.fused)
+    schedule = Schedule(_spread(order.events), order.fused)
     _count(schedule)
     return schedule
+
+
+# Values that wait for their turn beside each other, and how long a value takes, in values.
+_WINDOW = 16
+_LATENCY = {"div": 14, "rsqrt": 18, "sqrt": 24}
+
+
+def _spread(events: list[Event]) -> list[Event]:
+    """The same in an order in which values are ready when they are needed, as far as a few events can be exchanged.
+
+    One value a cycle begins. Where none of the next ones has all it needs, the one that has it first is next.
+    """
+    out: list[Event] = []
+    finished: dict[Value, int] = {}
+    waiting: list[Event] = []
+    pending: set[Value] = set()
+    time = place = 0
+    while place < len(events) or waiting:
+        while place < len(events) and len(waiting) < _WINDOW and events[place].what == "compute":
+            waiting.append(events[place])
+            pending.add(events[place].subject)
+            place += 1
+        if not waiting:
+            out.append(events[place])
+            place += 1
+            continue
+        best, first = 0, -1
+        for number, event in enumerate(waiting):
+            if not pending.isdisjoint(event.uses):
+                continue
+            ready = max([finished.get(value, 0) for value in event.uses], default=0)
+            if first < 0 or ready < first:
+                best, first = number, ready
+                if ready <= time:
+                    break
+        event = waiting.pop(best)
+        time = max(time, first)
+        pending.discard(event.subject)
+        finished[event.subject] = time + _LATENCY.get(event.subject.op, 4)
+        time += 1
+        out.append(event)
+    return out
 
 
 def operands(value: Value, fused: set[Value]) -> list[Value]:
@@ -83,10 +127,10 @@ def _roots(step: Step) -> list[Any]:
     return [*entered, *step.outputs]
 
 
-def _products(region: Region, results: list[Any]) -> set[Value]:
-    """Products that can be part of a sum: used once, where they are computed."""
+def _used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Value]]:
+    """All values that are needed, and how often."""
     count: Counter[Value] = Counter()
-    seen: set[Value] = set()
+    seen: dict[Value, None] = {}
     stack: list[Value] = []
 
     def need(entries: Iterable[Any]) -> None:
@@ -97,7 +141,7 @@ def _products(region: Region, results: list[Any]) -> set[Value]:
             value = stack.pop()
             if value in seen:
                 continue
-            seen.add(value)
+            seen[value] = None
             for x in operands(value, set()):
                 count[x] += 1
                 stack.append(x)
@@ -109,8 +153,13 @@ def _products(region: Region, results: list[Any]) -> set[Value]:
 
     visit(region)
     need(results)
+    return list(seen), count
+
+
+def _products(values: list[Value], count: Counter[Value]) -> set[Value]:
+    """Products that can be part of a sum: used once, where they are computed."""
     fused: set[Value] = set()
-    for value in seen:
+    for value in values:
         if value.op in ("add", "sub") and value.kind == "f":
             for x in _values(value.args):
                 if x.op == "mul" and count[x] == 1 and x.region is value.region:

@@ -10,7 +10,7 @@ Callers scale: |x|_inf <= 1 at admissible points, rows of E orthonormal or zero,
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +75,11 @@ class ArrowProblem:
     def present(self) -> jax.Array:
         """Every row counts."""
         return jnp.ones((1,) * self.guess.ndim, self.rhs.dtype)
+
+    @property
+    def predictor(self) -> Self:
+        """Nothing is refined."""
+        return self
 
     def apply(self, x: jax.Array) -> jax.Array:
         """A x."""

@@ -15,8 +15,8 @@ scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1; ra
 Callers scale: |x| about 1 at most, sigma <= 1, the rows of E orthonormal or zero.
 """
 
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -212,6 +212,11 @@ class BlockProblem:
     def present(self) -> Rows:
         """1 where a block is there."""
         return tuple(g.present for g in self.groups)
+
+    @property
+    def predictor(self) -> Self:
+        """Without refinement, which changes neither the steps that are taken nor what they end at."""
+        return replace(self, refinements=0)
 
     def equality(self, x: Rows) -> jax.Array:
         """E x, (eq, *lanes)."""

@@ -13,7 +13,7 @@ Source: Goulart and Chen (2024), "Clarabel: an interior-point solver for conic p
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -90,6 +90,11 @@ class Embedding:
     def present(self) -> jax.Array:
         """One for every row."""
         return jnp.ones((self.program.h.size + 1,), self.program.h.dtype)
+
+    @property
+    def predictor(self) -> Self:
+        """Regularised as the problem is, which only refinement takes back."""
+        return self
 
     def start(self) -> Iterate:
         """Zeros and ones."""

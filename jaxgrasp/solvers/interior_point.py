@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.fence import fenced
 
 Tree = Any
 
@@ -86,6 +86,11 @@ class Problem(Protocol):
 
     def factor(self, weights: Tree) -> Any:
         """Factorisation of the Newton system for weights z/s (like s)."""
+        ...
+
+    @property
+    def predictor(self) -> "Problem":
+        """The problem with no more care for rounding than a direction needs that only tells how far a step can go."""
         ...
 
     def solve(self, factors: Any, residuals: Residuals, shift: Tree) -> tuple[Tree, Tree, Tree]:
@@ -255,16 +260,13 @@ def _predict_correct(
             new = new._replace(s=kept_s, z=kept_z)
         return new, mu_new
 
-    def phase(_: jax.Array, state: tuple) -> tuple:
-        shift, *_ = state
+    def direction(problem: Problem, shift: Tree) -> tuple[Iterate, jax.Array, jax.Array]:
         dx, dy, rows = problem.solve(factors, residuals, shift)
         ds, dz, primal, dual = blocking(rows, shift, weights, residuals.rows, inverse_s, inverse_z)
-        step = Iterate(dx, dy, ds, dz)
-        return correct(iterate, step, primal, dual, mu, inverse_s), step, primal, dual
+        return Iterate(dx, dy, ds, dz), primal, dual
 
-    # The predictor's direction, then the corrector's.
-    _, step, primal, dual = repeat(2, phase, (affine_shift, iterate, mu, mu))
-    return advance(iterate, step, primal, dual, mu)
+    shift = correct(iterate, *direction(problem.predictor, affine_shift), mu, inverse_s)
+    return advance(iterate, *direction(problem, shift), mu)
 
 
 def _axpy(step: jax.Array, direction: Tree, point: Tree) -> Tree:
