@@ -52,8 +52,8 @@ def in_memory(value: Value) -> bool:
 def scheduled(program: Program) -> Schedule:
     """Put a program in order."""
     results = [x for out in program.outputs for x in out.flat]
-    chain_sums(*_used(program.builder.region, results))
-    order = _Order(_products(*_used(program.builder.region, results)))
+    values, count = _used(program.builder.region, results)
+    order = _Order(_products(chain_sums(values, count), count))
     order.region(program.builder.region, results)
     for number, value in enumerate(results):
         order.events.append(Event("store", number, _values([value])))
@@ -110,12 +110,21 @@ def operands(value: Value, fused: set[Value]) -> list[Value]:
         return _values([value.args[1][1]])
     if value.op in ("carry", "result", "counter"):
         return []
-    return _addressed([y for x in _values(value.args) for y in (_values(x.args) if x in fused else (x,))])
+    needed: list[Value] = []
+    for x in value.args:
+        if type(x) is not Value:
+            continue
+        if x in fused:
+            needed += [y for y in x.args if type(y) is Value]
+        else:
+            needed.append(x)
+    return _addressed(needed)
 
 
 def _addressed(values: list[Value]) -> list[Value]:
     """With what the addresses of those in memory depend on."""
-    return values + [y for x in values if x.op in ("own", "shared") for y in _values([x.args[1][1]])]
+    far = [x.args[1][1] for x in values if x.op in ("own", "shared")]
+    return values + _values(far) if far else values
 
 
 def _values(entries: Iterable[Any]) -> list[Value]:
@@ -132,6 +141,7 @@ def _used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Valu
     count: Counter[Value] = Counter()
     seen: dict[Value, None] = {}
     stack: list[Value] = []
+    none: set[Value] = set()
 
     def need(entries: Iterable[Any]) -> None:
         for value in _values(entries):
@@ -142,9 +152,9 @@ def _used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Valu
             if value in seen:
                 continue
             seen[value] = None
-            for x in operands(value, set()):
-                count[x] += 1
-                stack.append(x)
+            needed = operands(value, none)
+            count.update(needed)
+            stack.extend(needed)
 
     def visit(region: Region) -> None:
         for step in region.steps:
@@ -156,15 +166,14 @@ def _used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Valu
     return list(seen), count
 
 
-def _products(values: list[Value], count: Counter[Value]) -> set[Value]:
+def _products(sums: list[Value], count: Counter[Value]) -> set[Value]:
     """Products that can be part of a sum: used once, where they are computed."""
     fused: set[Value] = set()
-    for value in values:
-        if value.op in ("add", "sub") and value.kind == "f":
-            for x in _values(value.args):
-                if x.op == "mul" and count[x] == 1 and x.region is value.region:
-                    fused.add(x)
-                    break
+    for value in sums:
+        for x in _values(value.args):
+            if x.op == "mul" and count[x] == 1 and x.region is value.region:
+                fused.add(x)
+                break
     return fused
 
 

@@ -14,20 +14,25 @@ from jaxgrasp.kernels.expressions import Value
 _LONGEST = 16
 
 
-def chain_sums(values: Iterable[Value], count: Counter[Value]) -> None:
+def chain_sums(values: Iterable[Value], count: Counter[Value]) -> list[Value]:
     """Turn sums into chains, in place.
 
     Args:
         values: of a whole program.
-        count: how often each is used.
+        count: how often each is used; stays right for all but sums.
+
+    Returns:
+        The sums that are left.
     """
     inner: set[Value] = set()
     sums = [value for value in values if _is_sum(value)]
     for value in sums:
         inner.update(x for x in value.args if type(x) is Value and _is_sum(x) and _belongs(x, value, count))
+    left: list[Value] = []
     for value in sums:
         if value not in inner:
-            _chain(value, count)
+            _chain(value, count, left)
+    return left
 
 
 def _is_sum(value: Value) -> bool:
@@ -39,40 +44,46 @@ def _belongs(part: Value, whole: Value, count: Counter[Value]) -> bool:
     return count[part] == 1 and part.region is whole.region
 
 
-def _chain(root: Value, count: Counter[Value]) -> None:
+def _chain(root: Value, count: Counter[Value], left: list[Value]) -> None:
     terms: list[tuple[Any, bool]] = []
+    parts: list[Value] = []
     stack: list[tuple[Any, bool]] = [(root, True)]
     while stack:
         x, positive = stack.pop()
-        if type(x) is Value and _is_sum(x) and (x is root or _belongs(x, root, count)):
-            left, right = x.args
-            stack += [(right, positive == (x.op == "add")), (left, positive)]
+        if x is root or (type(x) is Value and _is_sum(x) and _belongs(x, root, count)):
+            parts.append(x)
+            first, second = x.args
+            stack += [(second, positive == (x.op == "add")), (first, positive)]
         else:
             terms.append((x, positive))
     products = [t for t in terms if type(t[0]) is Value and t[0].op == "mul" and _belongs(t[0], root, count)]
     if len(terms) < 3 or len(products) < 2:
+        left += parts
         return
     chosen = {id(x) for x, _ in products}
-    others = [t for t in terms if id(t[0]) not in chosen]
     # Something positive comes first: there always is, as what is leftmost is not subtracted.
-    ordered = others + products
-    first = next(number for number, (_, positive) in enumerate(ordered) if positive)
-    ordered.insert(0, ordered.pop(first))
-    root.op, root.args = _added(ordered, root)
+    ordered = _positive_first([t for t in terms if id(t[0]) not in chosen] + products)
+    root.op, root.args = _added(ordered, root, left)
+    left.append(root)
 
 
-def _added(terms: list[tuple[Any, bool]], like: Value) -> tuple[str, tuple]:
+def _positive_first(terms: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
+    number = next(number for number, (_, positive) in enumerate(terms) if positive)
+    return [terms[number], *terms[:number], *terms[number + 1 :]]
+
+
+def _added(terms: list[tuple[Any, bool]], like: Value, left: list[Value]) -> tuple[str, tuple]:
     """The operation that ends the sum of all terms, the first of which is positive."""
-    if len(terms) > _LONGEST:
-        half = len(terms) // 2
-        head, tail = terms[:half], terms[half:]
-        positive = next((number for number, term in enumerate(tail) if term[1]), None)
-        if positive is not None:
-            tail.insert(0, tail.pop(positive))
-            return "add", (_value(head, like), _value(tail, like))
+    half = len(terms) // 2
+    if len(terms) > _LONGEST and any(positive for _, positive in terms[half:]):
+        return "add", (_value(terms[:half], like, left), _value(_positive_first(terms[half:]), like, left))
     *before, (last, positive) = terms
-    return "add" if positive else "sub", (_value(before, like), last)
+    return "add" if positive else "sub", (_value(before, like, left), last)
 
 
-def _value(terms: list[tuple[Any, bool]], like: Value) -> Any:
-    return terms[0][0] if len(terms) == 1 else Value(*_added(terms, like), "f", like.region)
+def _value(terms: list[tuple[Any, bool]], like: Value, left: list[Value]) -> Any:
+    if len(terms) == 1:
+        return terms[0][0]
+    value = Value(*_added(terms, like, left), "f", like.region)
+    left.append(value)
+    return value
