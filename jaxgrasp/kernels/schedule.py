@@ -74,28 +74,31 @@ def _spread(events: list[Event]) -> list[Event]:
     """
     out: list[Event] = []
     finished: dict[Value, int] = {}
-    waiting: list[Event] = []
+    # With each event that waits, when it has all it needs; None as long as that is not known.
+    waiting: list[tuple[Event, int | None]] = []
     pending: set[Value] = set()
     time = place = 0
     while place < len(events) or waiting:
         while place < len(events) and len(waiting) < _WINDOW and events[place].what == "compute":
-            waiting.append(events[place])
+            waiting.append((events[place], None))
             pending.add(events[place].subject)
             place += 1
         if not waiting:
             out.append(events[place])
             place += 1
             continue
-        best, first = 0, -1
-        for number, event in enumerate(waiting):
-            if not pending.isdisjoint(event.uses):
-                continue
-            ready = max([finished.get(value, 0) for value in event.uses], default=0)
-            if first < 0 or ready < first:
+        best, first = -1, 0
+        for number, (event, ready) in enumerate(waiting):
+            if ready is None:
+                if not pending.isdisjoint(event.uses):
+                    continue
+                ready = max([finished.get(value, 0) for value in event.uses], default=0)
+                waiting[number] = event, ready
+            if best < 0 or ready < first:
                 best, first = number, ready
                 if ready <= time:
                     break
-        event = waiting.pop(best)
+        event, _ = waiting.pop(best)
         time = max(time, first)
         pending.discard(event.subject)
         finished[event.subject] = time + _LATENCY.get(event.subject.op, 4)
