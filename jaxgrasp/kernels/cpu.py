@@ -36,7 +36,7 @@ def module(program: Program, name: str, width: int, *, estimates: bool) -> str:
     """
     code = VectorCode(program.builder.dtype, width, estimates=estimates)
     _block(program, code)
-    body = "\n".join(["entry:", *code.allocations, *code.lines])
+    body = "\n".join(["entry:", *code.stack(), *code.lines])
     count = len(program.inputs) + len(program.outputs)
     values = {
         "@NAME@": f"@{name}",

@@ -194,6 +194,9 @@ class Builder:
                 return args[1] if args[0] else args[2]
             if args[1] is args[2]:
                 return args[1]
+            inner = args[1]
+            if type(inner) is Value and inner.op == "select" and inner.args[2] is args[2]:
+                return self.make("select", self.make("and", args[0], inner.args[0]), inner.args[1], args[2])
         elif op in ("max", "min") and args[0] is args[1]:
             return args[0]
         return None

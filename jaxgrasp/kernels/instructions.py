@@ -8,6 +8,10 @@ from typing import Any
 
 import numpy as np
 
+# Bytes of the stack that are near a pointer: the distance is then one byte of an instruction instead of four, and it is
+# from memory that instructions come in a kernel, which are more than a cache holds. So many pointers are kept.
+_NEAR, _POINTERS = 1 << 14, 7
+
 
 class Instructions:
     """Writes instructions.
@@ -26,7 +30,8 @@ class Instructions:
         self.types["byte"] = f"<{width} x i8>"
         self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
         self.lines: list[str] = []
-        self.allocations: list[str] = []
+        self.offsets: dict[str, int] = {}
+        self.used = 0
         self.declarations: set[str] = set()
         self.block = "entry"
         self.count = 0
@@ -53,12 +58,33 @@ class Instructions:
         self.block = block
 
     def allocate(self, kind: str, count: int = 1) -> str:
-        """Memory on the stack for vectors."""
+        """Memory on the stack for vectors; its name is for `pointer`."""
         self.count += 1
         name = f"%m{self.count}"
-        stored = f"[{count} x {self.types[kind]}]"
-        self.allocations.append(f"{name} = alloca {stored}, align 64")
+        size = count * (
+            self.width * self.dtype.itemsize if kind == "f" else self.width * 4 if kind == "i" else self.width
+        )
+        self.offsets[name] = self.used
+        self.used += -(-size // 64) * 64
         return name
+
+    def stack(self) -> list[str]:
+        """The code with which a function begins: the memory, and the pointers into it."""
+        lines = [f"%stack = alloca [{max(self.used, 64)} x i8], align 64"]
+        for number in range(min(_POINTERS, -(-max(self.used, 1) // _NEAR))):
+            place = f"getelementptr i8, ptr %stack, i64 {number * _NEAR + _NEAR // 2}"
+            # LLVM would count all of them from the same one if it knew.
+            lines += [f"%near{number}.known = {place}"]
+            lines += [f'%near{number} = call ptr asm "", "=r,0"(ptr %near{number}.known)']
+        return lines
+
+    def pointer(self, place: str) -> str:
+        """Address of memory on the stack; others' are returned as they are."""
+        offset = self.offsets.get(place)
+        if offset is None:
+            return place
+        number = min(offset // _NEAR, _POINTERS - 1)
+        return self.emit(f"getelementptr i8, ptr %near{number}, i64 {offset - number * _NEAR - _NEAR // 2}")
 
     def declare(self, text: str) -> None:
         """A function of LLVM's that is called."""
@@ -66,7 +92,7 @@ class Instructions:
 
     def entry(self, base: str, unit: str, index: str | int) -> str:
         """Address of an entry."""
-        return self.emit(f"getelementptr {unit}, ptr {base}, i64 {index}")
+        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {index}")
 
     def repeat(self, count: int | str, body: Callable[[str], None]) -> None:
         """`body(number)` so many times, at least once."""

@@ -39,6 +39,7 @@ class VectorCode(Instructions):
         self.counters: dict[Loop, tuple[str, str, int]] = {}
         self.carried: dict[Value, tuple[Loop, int]] = {}
         self.homes: set[Value] = set()
+        self.narrowed: dict[tuple[str, Value], str] = {}
 
     def operand(self, x: Any, kind: str) -> str:
         """The name or literal of a scalar."""
@@ -81,16 +82,35 @@ class VectorCode(Instructions):
 
     def compute(self, value: Value, number: int) -> None:
         """A value; the next value of something carried takes its place where nobody needs the old one any more."""
-        name = self.instruction(value)
-        place = None
         carried = self.carried.get(value)
-        if carried is not None:
-            loop, index = carried
-            if self.registers.schedule.last.get(loop.carries[index], -1) <= number:
-                place = self.slots[loop][index]
-                self.store_where(self.masks.get(loop), name, place, value.kind)
-                self.homes.add(value)
+        if carried is None:
+            self.registers.put(value, self.instruction(value))
+            return
+        (loop, index), place = carried, None
+        mask, old = self.masks.get(loop), loop.carries[index]
+        if mask is not None and value.op == "select" and value.args[2] is old:
+            # One choice for both: where the loop is over, nobody asks what else follows from the value.
+            name, mask = self.choice(value, self.both(mask, value.args[0])), None
+        else:
+            name = self.instruction(value)
+        if self.registers.schedule.last.get(old, -1) <= number:
+            place = self.slots[loop][index]
+            self.store_where(mask, name, place, value.kind)
+            self.homes.add(value)
         self.registers.put(value, name, place)
+
+    def both(self, mask: str, condition: Any) -> str:
+        """Where the mask and a condition hold; written once."""
+        name = self.operand(condition, "b")
+        found = self.narrowed.get((mask, condition))
+        if found is None:
+            found = self.narrowed[mask, condition] = self.emit(f"and {self.types['b']} {mask}, {name}")
+        return found
+
+    def choice(self, value: Value, mask: str) -> str:
+        """A select, by a mask that is written already."""
+        picked = [f"{self.types[value.kind]} {self.operand(x, value.kind)}" for x in value.args[1:]]
+        return self.emit(f"select {self.types['b']} {mask}, {', '.join(picked)}")
 
     def enter_loop(self, loop: Loop, number: int) -> None:
         """Carried values live in memory."""
@@ -161,11 +181,11 @@ class VectorCode(Instructions):
 
     def store(self, kind: str, name: str, place: str) -> None:
         """Put a vector in memory."""
-        self.do(f"store {self.types[kind]} {name}, ptr {place}, align {self.alignment(kind)}")
+        self.do(f"store {self.types[kind]} {name}, ptr {self.pointer(place)}, align {self.alignment(kind)}")
 
     def load(self, kind: str, place: str) -> str:
         """Read a vector."""
-        return self.emit(f"load {self.types[kind]}, ptr {place}, align {self.alignment(kind)}")
+        return self.emit(f"load {self.types[kind]}, ptr {self.pointer(place)}, align {self.alignment(kind)}")
 
     def alignment(self, kind: str) -> int:
         """Of vectors in memory, in bytes."""
@@ -174,16 +194,11 @@ class VectorCode(Instructions):
     def store_where(self, mask: str | None, new: str, slot: str, kind: str) -> None:
         """Put a vector in memory, where the mask holds."""
         vector = self.types[kind]
+        # A store by a mask would keep what is read soon after from being taken from it.
         if mask is not None:
             old = self.load(kind, slot)
-            new, mask = self.emit(f"select {self.types['b']} {mask}, {vector} {new}, {vector} {old}"), None
-        if mask is None:
-            self.store(kind, new, slot)
-            return
-        name = f"@llvm.masked.store.v{self.width}{'i32' if kind == 'i' else 'f' + str(8 * self.dtype.itemsize)}.p0"
-        self.declare(f"declare void {name}({vector}, ptr, i32, {self.types['b']})")
-        aligned = f"i32 {self.alignment(kind)}"
-        self.do(f"call void {name}({vector} {new}, ptr {slot}, {aligned}, {self.types['b']} {mask})")
+            new = self.emit(f"select {self.types['b']} {mask}, {vector} {new}, {vector} {old}")
+        self.store(kind, new, slot)
 
     def read(self, value: Value) -> str:
         """A value that lies in memory."""
@@ -206,8 +221,7 @@ class VectorCode(Instructions):
             size = self.intrinsic("fabs", self.operand(args[0], "f"))
             return self.emit(f"fcmp olt {self.types['f']} {size}, {self.constant(np.inf, 'f')}")
         if op == "select":
-            picked = [f"{vector} {self.operand(x, kind)}" for x in args[1:]]
-            return self.emit(f"select {self.types['b']} {self.operand(args[0], 'b')}, {', '.join(picked)}")
+            return self.choice(value, self.operand(args[0], "b"))
         if op == "convert":
             (x,) = args
             source = "i" if x.kind == "u" else x.kind
@@ -282,7 +296,7 @@ class VectorCode(Instructions):
         if counter is not None:
             moved = self.emit(f"mul i64 {self.registers.fetch(counter)}, {stride}")
             place = self.emit(f"add i64 {moved}, {offset}")
-        return self.emit(f"getelementptr {unit}, ptr {base}, i64 {place}")
+        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {place}")
 
     def load_own(self, kind: str, number: int, index: tuple) -> str:
         """A different number for every lane."""
