@@ -109,6 +109,27 @@ def test_arithmetic_with_numbers_that_are_not_ordinary(dtype):
         assert_same(function, x)
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_sums_of_products_with_every_sign(dtype):
+    """They are turned into chains; what else uses a product or a part of a sum keeps it."""
+
+    def function(x):
+        pairs = [x[i] * x[i + 1] for i in range(39)]
+        long = sum(pairs[1:30], pairs[0])
+        shared = pairs[30] + pairs[31]
+        return {
+            "long": long,
+            "taken away": x[0] - sum(pairs[31:38], pairs[38]),
+            "turned": (pairs[32] - pairs[33]) - (pairs[34] - (pairs[35] - x[3])),
+            "product": pairs[35],
+            "part": shared,
+            "whole": shared - pairs[36] - pairs[37] * 2,
+            "negative": -(pairs[36] + pairs[37] * x[5]) - x[2] * x[7],
+        }
+
+    assert_same(function, 1 + jnp.abs(rows(20, 40, dtype=dtype)))
+
+
 def test_loops_end_for_each_problem_by_itself():
     """Newton's iteration: some problems take long, and none goes on after its end."""
 
@@ -295,6 +316,30 @@ def test_kernels_are_kept_on_disk(tmp_path):
     folder.chmod(0o777)
     monkey = "from jaxgrasp.kernels import machine; print(machine.cached('" + kept[0].name + "'))"
     assert run(monkey, XDG_CACHE_HOME=str(tmp_path)).stdout.strip() == "None"
+
+
+KNOWN = """
+import jax.numpy as jnp
+from jaxgrasp.kernels import native
+def twice(parts):
+    print("traced")
+    return {"out": parts[0] * 2}
+for width in (2, 2, 5):
+    out = native.fused(twice, [jnp.ones((3, width))], (False,), lambda leaves: None, "twice")
+    print(float(out["out"].sum()))
+"""
+
+
+def test_what_is_known_by_its_name_is_not_traced_again(tmp_path):
+    done = run(KNOWN, XDG_CACHE_HOME=str(tmp_path))
+    assert done.stdout.split() == ["traced", "12.0", "12.0", "traced", "30.0"]
+    assert run(KNOWN, XDG_CACHE_HOME=str(tmp_path)).stdout.split() == ["12.0", "12.0", "30.0"]
+    # Compiled code is long, what is known of a program short: without the first it is traced after all.
+    for file in (tmp_path / "jaxgrasp" / "kernels").iterdir():
+        if file.read_bytes()[32:36] == b"\x7fELF":
+            file.unlink()
+    again = run(KNOWN, XDG_CACHE_HOME=str(tmp_path)).stdout.split()
+    assert again == ["traced", "12.0", "12.0", "traced", "30.0"]
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):
