@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-# Bytes of the stack that are near a pointer: the distance is then one byte of an instruction instead of four, and it is
-# from memory that instructions come in a kernel, which are more than a cache holds. So many pointers are kept.
+# Bytes of the stack that AVX-512's instructions reach from a pointer with one byte in place of four, and how many such
+# pointers are kept. A kernel's loop is more code than a cache holds: reading it is what takes the time.
 _NEAR, _POINTERS = 1 << 14, 7
 
 

@@ -17,8 +17,9 @@ from jaxgrasp.kernels.entries import array, kinds_of, known, objects
 from jaxgrasp.kernels.expressions import Builder, Region, Unsupported, Value, kind_of
 from jaxgrasp.kernels.rules import ELEMENTWISE, RULES
 
-# Loops of at most so many rounds are spelt out where a round depends on its number, and where each leaves a result.
-_SPELT_OUT, _STACKED = 16, 64
+# Loops of at most so many rounds are spelt out: always, as the first round often starts from zeros and the last one
+# leaves what nobody asks for; where a round depends on its number; and where each leaves a result.
+_SHORT, _SPELT_OUT, _STACKED = 2, 16, 64
 # Entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
 _MOST_ENTRIES = 400_000
 
@@ -171,7 +172,7 @@ class _Lowering:
         n_ys = len(body.jaxpr.outvars) - n_carry
         counters = _counters(body.jaxpr, n_consts, n_carry, carry)
         numbered = xs or any(used for _, used in counters.values())
-        if length <= 2 or (numbered and length <= _SPELT_OUT) or (n_ys and length <= _STACKED):
+        if length <= _SHORT or (numbered and length <= _SPELT_OUT) or (n_ys and length <= _STACKED):
             rows: list[list[np.ndarray]] = [[] for _ in range(n_ys)]
             for i in range(length):
                 at = length - 1 - i if reverse else i
