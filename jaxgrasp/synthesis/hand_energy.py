@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxgrasp.contact import Contacts, required_wrench
+from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.hands.surroundings import Surroundings
 from jaxgrasp.robustness import largest_disturbance
@@ -101,10 +101,11 @@ def terms_of(
         friction=near.friction,
         max_force=hand.max_force * (_LEAST_FORCE + (1 - _LEAST_FORCE) * share),
     )
+    weight = -hand.object_mass * inward(jnp.broadcast_to(task.gravity, (len(qpos), 3)))
     margin = largest_disturbance(
         contacts,
         task.disturbances,
-        required_wrench(hand.object_mass, gravity=inward(jnp.broadcast_to(task.gravity, (len(qpos), 3)))),
+        jnp.concatenate([weight, jnp.zeros_like(weight)], -1),
         cone_margin=reserve,
         actuation=around.actuation(qpos, near, contacts) if torque_limits else None,
     ).margin
