@@ -223,7 +223,7 @@ def test_self_distances_are_those_of_mujoco(hand):
     [
         ({"starts": 0}, "starts"),
         ({"steps": 0}, "steps"),
-        ({"share": 1.5}, "share"),
+        ({"squeeze": -1.0}, "squeeze"),
         ({"min_contacts": 0}, "min_contacts"),
         ({"links": ["thumb"]}, "links"),
         ({"links": []}, "links"),

@@ -80,7 +80,7 @@ def synthesize_hand_grasps(
     starts: int = 1024,
     steps: int = 200,
     min_contacts: int = 3,
-    share: float = 0.75,
+    squeeze: float | None = None,
     progress: Callable[[int, int, dict[str, np.ndarray]], None] | None = None,
 ) -> HandSynthesis:
     """Find configurations of a hand whose grasps of an object withstand much, by gradient from random starts.
@@ -103,7 +103,9 @@ def synthesize_hand_grasps(
         starts: How many.
         steps: Of each.
         min_contacts: With fewer a grasp is not good.
-        share: Of the margin for which commands are found by (22).
+        squeeze: The margin for which the commands are found by (22), as far as a grasp has `SHARE` of it; None is twice
+            the object's weight. Soft servos give way under forces that cancel each other, and turn the object out of
+            the grasp: more is not better.
         progress: Called every few steps with the numbers of steps done and to be done, over all batches of starts, and
             the record of the batch.
 
@@ -117,7 +119,7 @@ def synthesize_hand_grasps(
         ("starts", starts, starts >= 1, "at least 1"),
         ("steps", steps, steps >= 1, "at least 1"),
         ("min_contacts", min_contacts, min_contacts >= 1, "at least 1"),
-        ("share", share, 0 < share <= 1, "a number in (0, 1]"),
+        ("squeeze", squeeze, squeeze is None or 0 <= squeeze < np.inf, "a finite number, at least 0"),
     )
     for name, got, admissible, wanted in checks:
         if not admissible:
@@ -135,7 +137,9 @@ def synthesize_hand_grasps(
     begin = random_starts(around, starts, np.random.default_rng(np.asarray(jax.random.key_data(key))))
     ends, record = _descend(around, begin, task, steps, torque_limits, progress)
     closed = np.asarray(close_fingers(hand, _padded(ends, len(begin))))[: len(ends)]
-    judge = lambda qpos: judged(around, qpos, disturbances, min_contacts, share)  # noqa: E731
+    weight = hand.object_mass * float(np.linalg.norm(hand.model.opt.gravity))
+    wanted = jnp.asarray(2 * weight if squeeze is None else squeeze, float)
+    judge = lambda qpos: judged(around, qpos, disturbances, min_contacts, wanted)  # noqa: E731
     first = judge(np.asarray(close_fingers(hand, begin))[: len(ends)])
     found = judge(closed)
     order = np.lexsort((-np.nan_to_num(found.margin, nan=-np.inf), found.verdict != Verdict.GOOD))

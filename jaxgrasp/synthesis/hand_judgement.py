@@ -17,6 +17,8 @@ from jaxgrasp.solvers.status import Status
 
 # Deeper than this, m, a grasp is not good; and with a margin of no more than that.
 DEEPEST, LEAST_MARGIN = 2e-3, 1e-4
+# Of its margin, up to which a grasp can be squeezed.
+SHARE = 0.9
 # Grasps at a time.
 _TILE = 512
 
@@ -49,8 +51,8 @@ class Judgement:
     squeeze: Float[np.ndarray, "grasps nq"]
     """Where the joints would go under the commands if nothing were in the way; NaN where there are none."""
     controls: Float[np.ndarray, "grasps actuators"]
-    """Commands, in the order of `HandObject.actuator_names`, that squeeze as hard as (22) says for a share of the
-    margin; NaN where it has no answer."""
+    """Commands, in the order of `HandObject.actuator_names`, that squeeze as hard as (22) says; NaN where it has no
+    answer."""
     contact_points: Float[np.ndarray, "grasps contacts 3"]
     """m, world frame."""
     forces: Float[np.ndarray, "grasps contacts 3"]
@@ -79,7 +81,7 @@ def judged(
     qpos: Float[np.ndarray, "grasps nq"],
     disturbances: DisturbanceSet,
     min_contacts: int,
-    share: float,
+    squeeze: Float[Array, ""],
 ) -> Judgement:
     """Judges grasps whose fingers are closed.
 
@@ -88,14 +90,14 @@ def judged(
         qpos: The grasps.
         disturbances: What they shall withstand.
         min_contacts: With fewer they are not good.
-        share: Of the margin for which commands are found.
+        squeeze: The margin for which commands are found, at most `SHARE` of that of the grasp.
     """
     count, size = len(qpos), min(_TILE, len(qpos))
     parts = []
     for first in range(0, count, size):
         # The last tile is filled up, so that one compilation serves all.
         rows = qpos[np.arange(first, first + size) % count]
-        found = _judged(around, jnp.asarray(rows), disturbances, share)
+        found = _judged(around, jnp.asarray(rows), disturbances, squeeze)
         parts.append({name: np.asarray(x)[: count - first] for name, x in found.items()})
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     solved = (found["status"] == Status.SOLVED) & (found["margin"] > LEAST_MARGIN)
@@ -112,13 +114,14 @@ def judged(
 
 
 def _judged(
-    around: Surroundings, qpos: Float[Array, "n nq"], disturbances: DisturbanceSet, share: float
+    around: Surroundings, qpos: Float[Array, "n nq"], disturbances: DisturbanceSet, squeeze: Float[Array, ""]
 ) -> dict[str, Array]:
     hand = around.hand
     grasps = hand.grasps(qpos)
     given = {"required_wrench": grasps.required_wrench, "actuation": grasps.actuation}
     best = largest_disturbance(grasps.contacts, disturbances, **given)
-    hold = least_effort(grasps.contacts, disturbances, share * jnp.maximum(best.margin, 0), **given)
+    wanted = jnp.minimum(SHARE * jnp.maximum(best.margin, 0), squeeze)
+    hold = least_effort(grasps.contacts, disturbances, wanted, **given)
     points, forces = grasps.in_world_frame(hold.forces)
     self_penetration, landmarks = _of_the_hand(qpos, around)
     return {
