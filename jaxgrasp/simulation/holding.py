@@ -94,20 +94,19 @@ def hold_trials(
     controls, idle = (np.where(np.isnan(idle), 0.0, x) for x in (controls, idle))
     known &= np.isfinite(controls).all(-1)
     trials = _nothing(count, hand.nq, pushes)
-    rows = np.flatnonzero(known)
-    for first in range(0, len(rows), _TILE):
-        tile = rows[first : first + _TILE]
-        found = _run(rollouts, qpos[tile], idle[tile], controls[tile], pushes[tile])
+    for first in range(0, count, _TILE):
+        rows = first + np.flatnonzero(known[first : first + _TILE])
+        found = _run(rollouts, qpos[rows], idle[rows], controls[rows], pushes[rows])
         for each in fields(Trials):
-            getattr(trials, each.name)[tile] = getattr(found, each.name)
+            getattr(trials, each.name)[rows] = getattr(found, each.name)
         if progress is not None:
-            progress(int(tile[-1]) + 1)
+            progress(min(first + _TILE, count))
     return trials
 
 
 def _run(rollouts: Rollouts, qpos: np.ndarray, idle: np.ndarray, controls: np.ndarray, pushes: np.ndarray) -> Trials:
     """All courses of a tile."""
-    trials, none = _nothing(*qpos.shape, pushes), np.zeros((len(qpos), 3))
+    trials, none = _nothing(len(qpos), qpos.shape[1], pushes), np.zeros((len(qpos), 3))
     weight, begun = none + rollouts.weight, rollouts.pose(qpos)
     squeezed = rollouts.run(_SQUEEZE, rollouts.start(qpos, idle), (idle, controls), (none, none), begun)
     left = rollouts.pose(rollouts.qpos(squeezed))
@@ -118,8 +117,8 @@ def _run(rollouts: Rollouts, qpos: np.ndarray, idle: np.ndarray, controls: np.nd
     # What gravity takes need not be pushed.
     lanes, course = (x.ravel() for x in np.meshgrid(np.flatnonzero(trials.held_gravity), range(6), indexing="ij"))
     force = weight[lanes] + pushes[lanes, None] * DIRECTIONS[course]
-    given = (controls[lanes], controls[lanes]), (weight[lanes], force), Pose(*[x[lanes] for x in left])
-    pushed = rollouts.run(_LOAD, borne.take(lanes), *given)
+    given, still = controls[lanes], Pose(left.position[lanes], left.quaternion[lanes])
+    pushed = rollouts.run(_LOAD, borne.take(lanes), (given, given), (weight[lanes], force), still)
     trials.held_pushes[lanes, course] = _record(trials, rollouts, pushed, lanes, 1 + course)
     trials.held[:] = trials.held_pushes.all(-1)
     return trials

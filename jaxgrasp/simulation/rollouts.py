@@ -15,8 +15,9 @@ from mujoco import rollout
 from jaxgrasp.hands import HandObject
 from jaxgrasp.hands.bodies import bodies_below
 
-# kg and kg m^2, added to a free base of the hand, which thus stays: 10 N move it by less than a micrometre in a second.
-_ANCHORED = 1e7
+# kg and kg m^2, added to a free base of the hand: 10 N move it by 0.1 mm in half a second. With a hundred times as much
+# the accelerations of light fingers drown in rounding.
+_ANCHORED = 1e4
 # Steps at a time: what is kept of them is bounded.
 _STEPS = 25
 _GIVEN = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
@@ -132,6 +133,7 @@ class Rollouts:
         given = np.zeros((count, _STEPS, model.nu + 6 * model.nbody))
         given[..., : model.nu] = self._others
         farthest, turned = np.zeros(count), np.zeros(count)
+        still = Pose(reference.position[:, None], reference.quaternion[:, None])
         with _quiet(), rollout.Rollout(nthread=len(self._data)) as pool:
             for first in range(0, steps if count else 0, _STEPS):
                 time = model.opt.timestep * np.arange(first, min(first + _STEPS, steps))
@@ -139,9 +141,9 @@ class Rollouts:
                 part = given[:, : len(time)]
                 part[..., self._hand.actuators] = _between(commands, share)
                 part[..., self._wrench] = self._share * _between(force, share)[..., None, :]
-                states, _ = pool.rollout(model, self._data, state, part, control_spec=_GIVEN)
+                states = np.asarray(pool.rollout(model, self._data, state, part, control_spec=_GIVEN)[0])
                 state = states[:, -1]
-                apart = distances(self.pose(states[..., 1 : 1 + model.nq]), Pose(*[x[:, None] for x in reference]))
+                apart = distances(self.pose(states[..., 1 : 1 + model.nq]), still)
                 farthest, turned = (np.maximum(a, b.max(1)) for a, b in zip((farthest, turned), apart, strict=True))
         # MuJoCo begins anew where a state is not finite or velocities are huge, and a rollout then goes no further.
         in_time = np.abs(state[:, 0] - begun - steps * model.opt.timestep) < 0.5 * model.opt.timestep
@@ -201,7 +203,7 @@ def _welded(model: mujoco.MjModel, weld: int) -> np.ndarray:
 
 
 def _anchored(hand: HandObject) -> mujoco.MjModel:
-    """The scene without weight, free bases of the hand held by an inertia of thousands of tons."""
+    """The scene without weight, free bases of the hand held by an inertia of tons."""
     model = copy(hand.model)
     numbers = hand.actuators
     integrating = numbers[model.actuator_dyntype[numbers] == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)]
