@@ -38,6 +38,8 @@ from jaxgrasp.synthesis import synthesize_hand_grasps  # noqa: E402
 HANDS = {"Shadow Hand": shadow_hand, "four fingers": four_fingers}
 OBJECTS = ("sphere", "box", "capsule", "cylinder", "mesh")
 STARTS, QUICK_STARTS = 256, 32
+MORE = {"Shadow Hand": 16, "four fingers": 1}
+"""So many times as many random starts: of one in fifty the Shadow Hand's fingers are not inside each other."""
 SYNTHESISED, RANDOM = "synthesised", "random, closed"
 LEAST_CONTACTS, DEEPEST = 3, 2e-3
 """m, of hand and object and of the hand in itself."""
@@ -170,38 +172,44 @@ def measure(name: str, hand: HandObject, starts: int, seed: int) -> Arm:
     return Arm(candidates, margin, self_penetration(hand, qpos), commanded, trials, seconds)
 
 
-def values_of(arm: Arm) -> dict[str, np.ndarray]:
-    """Every metric, and what else might tell grasps that hold from others."""
-    columns, values = arm.candidates.columns, {}
+def values_of(arm: Arm, rows: np.ndarray, size: int) -> dict[str, np.ndarray]:
+    """Every metric of some grasps, and what else might tell those that hold from others."""
+    few, values = arm.candidates.take(rows), {}
+    # Filled up to one size for all arms, so that programs are compiled once for a hand.
+    filled = arm.candidates.take(np.resize(rows, size)) if len(rows) else few
     for name, metric in METRICS.items():
-        if name == LEFT_OUT:
+        if name != LEFT_OUT:
+            values[name] = score(filled if metric.batched else few, name, FORCES)[: len(rows)]
+    own = {"contacts": few.columns["touching"], "penetration": few.columns["penetration"]}
+    return values | own | {"self-penetration": arm.self_penetration[rows]}
+
+
+def areas(arms: dict[str, list[Arm]], starts: int, resamples: int) -> tuple[list[list[str]], list[str]]:
+    """AUC by metric of squeezed grasps, of all and of those that are fine, and how many there are.
+
+    Of each arm as many as there are synthesised ones, the first.
+    """
+    every = [(label, arm, np.flatnonzero(arm.commanded)[:starts]) for label, list_ in arms.items() for arm in list_]
+    parts = [values_of(arm, rows, starts) for _, arm, rows in every]
+    values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    held = np.concatenate([arm.trials.held[rows] for _, arm, rows in every])
+    fine = np.concatenate([arm.fine[rows] for _, arm, rows in every])
+    labels = np.repeat([label for label, _, _ in every], [len(rows) for _, _, rows in every])
+    smaller = frozenset(n for n in METRICS if not METRICS[n].larger_is_better) | {"penetration", "self-penetration"}
+    columns, told = [list(values)], []
+    for counted in (np.ones_like(fine), fine):
+        success, within = held[counted], labels[counted]
+        told.append(f"{int(success.sum())} of {len(success)}")
+        if not any(0 < success[within == label].sum() < np.sum(within == label) for label in np.unique(within)):
+            columns.append([""] * len(values))
             continue
-        # Hulls are found for one grasp after the other: only for those that count below.
-        rows = np.arange(len(arm.margin)) if metric.batched else np.flatnonzero(arm.commanded)
-        values[name] = np.full(len(arm.margin), np.nan)
-        values[name][rows] = score(arm.candidates.take(rows), name, FORCES)
-    own = {"contacts": columns["touching"], "penetration": columns["penetration"]}
-    return values | own | {"self-penetration": arm.self_penetration}
-
-
-def areas(arms: dict[str, list[Arm]], resamples: int) -> tuple[list[str], str]:
-    """Rows of a table of AUC by metric, of all grasps that were squeezed, and how many of them there are."""
-    every = [(label, arm) for label, list_ in arms.items() for arm in list_]
-    counted = np.concatenate([arm.commanded for _, arm in every])
-    success = np.concatenate([arm.trials.held for _, arm in every])[counted]
-    labels = np.repeat([label for label, _ in every], [len(arm.margin) for _, arm in every])[counted]
-    parts = [values_of(arm) for _, arm in every]
-    values = {name: np.concatenate([part[name] for part in parts])[counted] for name in parts[0]}
-    smaller = {name for name in METRICS if not METRICS[name].larger_is_better} | {"penetration", "self-penetration"}
-    told = f"{int(success.sum())} of {len(success)} grasps hold"
-    if not any(0 < success[labels == label].sum() < np.sum(labels == label) for label in np.unique(labels)):
-        return [], told
-    found = compare_metrics(
-        values, success, smaller_is_better=frozenset(smaller), within=labels, resamples=resamples
-    ).prediction
-    assert found is not None
-    rows = zip(values, found.auc, found.interval, strict=True)
-    return [f"{name} | {auc:.2f} ({low:.2f}-{high:.2f})" for name, auc, (low, high) in rows], told
+        some = {name: value[counted] for name, value in values.items()}
+        options = {"smaller_is_better": smaller, "within": within, "resamples": resamples}
+        found = compare_metrics(some, success, **options).prediction
+        assert found is not None
+        pairs = zip(found.auc, found.interval, strict=True)
+        columns.append([f"{auc:.2f} ({low:.2f}-{high:.2f})" for auc, (low, high) in pairs])
+    return [list(row) for row in zip(*columns, strict=True)], told
 
 
 def table(header: list[str], rows: list[list[str]]) -> list[str]:
@@ -217,8 +225,9 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
         "# Do synthesised grasps of real hands hold?",
         "",
         wrapped(
-            f"{starts} starts of each kind: `synthesize_hand_grasps`, and `sample_configurations`, whose fingers are "
-            f"closed on an object that is turned and shifted at random. Wanted are at least {LEAST_CONTACTS} contacts, "
+            "Starts are synthesised by `synthesize_hand_grasps`, or random: `sample_configurations`, with fingers "
+            "closed on an object that is turned and shifted at random; of these there are more where few have what is "
+            f"wanted. Wanted are at least {LEAST_CONTACTS} contacts, "
             f"no more than {1e3 * DEEPEST:g} mm of penetration (hand and object by `HandGrasps`, the hand in itself by "
             "MuJoCo) and a positive margin (21) under six unit forces with the object's weight borne and the "
             f"actuators' limits kept. Squeeze commands of both are those of (22) for {SHARE:.0%} of the margin, "
@@ -246,24 +255,26 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
     lines += ["", "## What tells grasps that hold from others?", ""]
     lines += [
         wrapped(
-            "Area under the ROC curve of each metric, of all grasps with squeeze commands, both kinds together, pairs "
-            f"on the same object alone, with 95 % bootstrap intervals ({resamples} resamples). {LEFT_OUT} is left to "
-            "its bound."
+            f"Area under the ROC curve of each metric, with 95 % bootstrap intervals ({resamples} resamples), pairs on "
+            f"the same object alone: of all grasps with squeeze commands, both kinds together, of each and on each "
+            f"object the first {starts}; and of those of them with all three. {LEFT_OUT} is left to its bound."
         ),
         "",
     ]
     for hand in HANDS:
         of_hand = {object: list(arms.values()) for (h, object), arms in results.items() if h == hand}
-        rows, told = areas(of_hand, resamples)
-        lines += [f"{hand}: {told}.", "", *table(["metric", "AUC"], [row.split(" | ") for row in rows]), ""]
+        rows, told = areas(of_hand, starts, resamples)
+        header = ["metric", f"AUC, squeezed ({told[0]} hold)", f"AUC, with all three ({told[1]} hold)"]
+        lines += [f"{hand}:", "", *table(header, rows), ""]
     lines += ["## How fast, and where the time goes", ""]
     rows = []
     for (hand, object), arms in results.items():
         for name, arm in arms.items():
             s = arm.seconds
-            warm = [f"{1e3 * s[p] / starts:.2f}" for p in ("search", "contacts", "margin (21)", "squeeze (22)")]
+            count = len(arm.margin)
+            warm = [f"{1e3 * s[p] / count:.2f}" for p in ("search", "contacts", "margin (21)", "squeeze (22)")]
             trial = f"{1e3 * s['trial'] / max(1, arm.commanded.sum()):.0f}"
-            rates = [f"{starts / s['search']:.0f}", f"{arm.fine.sum() / s['search']:.1f}"]
+            rates = [f"{count / s['search']:.0f}", f"{arm.fine.sum() / s['search']:.1f}"]
             rows.append([hand, object, name, *rates, f"{s['search, first'] - s['search']:.1f}", *warm, trial])
     header = ["hand", "object", "starts", "starts a second", "with all three a second", "first run longer by, s"]
     header += [f"{part}, ms a start" for part in ("search", "contacts", "margin (21)", "squeeze (22)")]
@@ -289,7 +300,8 @@ def main() -> None:
             for seed, object in enumerate(OBJECTS):
                 hand, arms = HandObject.from_mjcf(scene(object), "object"), {}
                 for name in (SYNTHESISED, RANDOM):
-                    arms[name] = measure(name, hand, starts, seed)
+                    count = starts * MORE[hand_name] if name == RANDOM else starts
+                    arms[name] = measure(name, hand, count, seed)
                     told = ", ".join(f"{what} {share}" for what, share in shares(arms[name]).items())
                     progress.console.print(f"{hand_name}, {object}, {name}: {told}")
                     progress.advance(task)
