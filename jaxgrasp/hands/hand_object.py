@@ -132,7 +132,12 @@ class HandObject:
     @property
     def actuator_names(self) -> tuple[str, ...]:
         """The actuators of `HandGrasps.actuation`, in order."""
-        return tuple(self.model.actuator(a).name for a in self._actuators.numbers)
+        return tuple(self.model.actuator(a).name for a in self.actuators)
+
+    @property
+    def actuators(self) -> np.ndarray:
+        """The numbers of `actuator_names` in the model."""
+        return self._actuators.numbers
 
     @property
     def object_mass(self) -> float:
