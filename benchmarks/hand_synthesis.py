@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,29 +26,26 @@ from scipy.stats import binomtest
 jax.config.update("jax_enable_x64", True)
 
 import jaxgrasp as jg  # noqa: E402
-from jaxgrasp.candidates import Candidates  # noqa: E402
 from jaxgrasp.hands import HandObject, sample_configurations  # noqa: E402
 from jaxgrasp.hands.scenes import four_fingers, shadow_hand  # noqa: E402
+from jaxgrasp.hands.surroundings import Surroundings  # noqa: E402
 from jaxgrasp.metrics import METRICS  # noqa: E402
 from jaxgrasp.ranking import compare_metrics, score  # noqa: E402
 from jaxgrasp.ranking.configurations import candidates_of  # noqa: E402
-from jaxgrasp.ranking.tiles import columns_of, margins, solve_in_tiles, tightening  # noqa: E402
 from jaxgrasp.simulation import Trials, hold_trials  # noqa: E402
-from jaxgrasp.synthesis import synthesize_hand_grasps  # noqa: E402
+from jaxgrasp.synthesis import Verdict, synthesize_hand_grasps  # noqa: E402
+from jaxgrasp.synthesis.hand_judgement import DEEPEST, LEAST_MARGIN, SHARE, Judgement, judged  # noqa: E402
 
 HANDS = {"Shadow Hand": shadow_hand, "four fingers": four_fingers}
 OBJECTS = ("sphere", "box", "capsule", "cylinder", "mesh")
-STARTS, QUICK_STARTS = 256, 32
-MORE = {"Shadow Hand": 16, "four fingers": 1}
+STARTS, QUICK_STARTS = 256, 96
+MORE = {"Shadow Hand": 4, "four fingers": 1}
 """So many times as many random starts: of one in fifty the Shadow Hand's fingers are not inside each other."""
 SYNTHESISED, RANDOM = "synthesised", "random, closed"
-LEAST_CONTACTS, DEEPEST = 3, 2e-3
-"""m, of hand and object and of the hand in itself."""
-SHARE, MOST = 0.9, 2.0
-"""(22) is asked for this share of the margin, but for no more than so many times the object's weight, which is what
-pushes: soft servos give way under forces that cancel each other, and the object turns out of the grasp. Of 23 random
-grasps of a ball by the Shadow Hand that has no limits of commands 8 held at 0.75 of the margin, 18 with no more than
-1.5 times the weight, and 21 at 0.75 with servos four times as stiff."""
+JUDGED = 96
+"""So many grasps of each kind on each object have all metrics computed."""
+LEAST_CONTACTS, MOST = 3, 2.0
+"""(22) is asked for so many times the object's weight, as far as the margin goes."""
 LEFT_OUT = "ferrari_canny_linf"
 """Its hull has too many points with eight contacts; its bound is among the others."""
 FORCES = jg.DisturbanceSet.forces(1.0)
@@ -58,11 +56,8 @@ Clock = dict[str, float]
 class Arm:
     """Grasps of one hand on one object, found in one way, and what became of them."""
 
-    candidates: Candidates
-    margin: Float[np.ndarray, " n"]
-    self_penetration: Float[np.ndarray, " n"]
-    commanded: Bool[np.ndarray, " n"]
-    """Whether (22) has an answer: only then there are squeeze commands."""
+    hand: HandObject
+    judgement: Judgement
     trials: Trials
     seconds: Clock
     """Of the parts of the work, all compiled before but the search's first run."""
@@ -70,17 +65,21 @@ class Arm:
     @property
     def checks(self) -> dict[str, Bool[np.ndarray, " n"]]:
         """What a grasp must have, one after the other."""
-        columns = self.candidates.columns
-        clear = (columns["penetration"] <= DEEPEST) & (self.self_penetration <= DEEPEST)
+        found = self.judgement
         return {
-            f"{LEAST_CONTACTS} contacts": columns["touching"] >= LEAST_CONTACTS,
-            f"penetration below {1e3 * DEEPEST:g} mm": clear,
-            "positive margin": self.margin > 0,
+            f"{LEAST_CONTACTS} contacts": found.touching >= LEAST_CONTACTS,
+            f"penetration below {1e3 * DEEPEST:g} mm": np.maximum(found.penetration, found.self_penetration) <= DEEPEST,
+            "positive margin": (found.status == jg.Status.SOLVED) & (found.margin > LEAST_MARGIN),
         }
 
     @property
     def fine(self) -> Bool[np.ndarray, " n"]:
-        return np.all(list(self.checks.values()), 0)
+        return self.judgement.verdict == Verdict.GOOD
+
+    @property
+    def commanded(self) -> Bool[np.ndarray, " n"]:
+        """Whether (22) has an answer: only then there are squeeze commands."""
+        return np.isfinite(self.judgement.controls).all(-1)
 
 
 @dataclass(frozen=True)
@@ -119,31 +118,13 @@ def shares(arm: Arm) -> dict[str, Share]:
     }
 
 
-def found_by(name: str, hand: HandObject, starts: int, seed: int) -> Float[np.ndarray, "n nq"]:
+def found_by(name: str, hand: HandObject, starts: int, seed: int, tile: int) -> Float[np.ndarray, "n nq"]:
     if name == RANDOM:
-        return sample_configurations(hand, starts, seed)
-    return np.asarray(synthesize_hand_grasps(hand, jax.random.key(seed), starts=starts, progress=None).qpos)
+        return sample_configurations(hand, starts, seed, tile=tile)
+    return synthesize_hand_grasps(hand, jax.random.key(seed), starts=starts).qpos
 
 
-def self_penetration(hand: HandObject, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, " n"]:
-    """How deep the hand's links are in each other, m, where MuJoCo lets them collide."""
-    model, data, deepest = hand.model, mujoco.MjData(hand.model), []
-    for each in qpos:
-        data.qpos[:] = each
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        apart = (model.geom_bodyid[data.contact.geom] != hand.object_body).all(-1)
-        deepest.append(max(0.0, -data.contact.dist[apart].min(initial=0.0)))
-    return np.array(deepest)
-
-
-def solved(solver: Callable, columns: dict[str, np.ndarray]) -> list[np.ndarray]:
-    """A solver's answer for all candidates."""
-    parts = solve_in_tiles(solver, columns, FORCES, gravity=0.0, cone_edges=8, tile=None)
-    return [np.concatenate(answers) for answers in zip(*(answer for _, answer in parts), strict=True)]
-
-
-def measure(name: str, hand: HandObject, starts: int, seed: int) -> Arm:
+def measure(name: str, hand: HandObject, starts: int, seed: int, tile: int) -> Arm:
     seconds: Clock = {}
 
     def timed(part: str, work: Callable):
@@ -152,44 +133,38 @@ def measure(name: str, hand: HandObject, starts: int, seed: int) -> Arm:
         seconds[part] = time.perf_counter() - begun
         return answer
 
-    qpos = timed("search, first", lambda: found_by(name, hand, starts, seed))
+    qpos = timed("search, first", lambda: found_by(name, hand, starts, seed, tile))
     # The same once more: what is compiled now takes no time.
-    timed("search", lambda: found_by(name, hand, starts, seed))
-    read = lambda: candidates_of(hand, qpos, source=name)  # noqa: E731
-    candidates = read()
-    timed("contacts", read)
-    columns = columns_of(candidates)
-    margin, _, status = solved(margins, columns)
-    timed("margin (21)", lambda: solved(margins, columns))
-    margin = np.where(status == jg.Status.SOLVED, margin, np.nan)
+    timed("search", lambda: found_by(name, hand, starts, seed, tile))
     weight = hand.object_mass * float(np.linalg.norm(hand.model.opt.gravity))
-    wanted = columns | {"wanted": np.minimum(SHARE * margin, MOST * weight)}
-    *_, controls = solved(tightening, wanted)
-    timed("squeeze (22)", lambda: solved(tightening, wanted))
-    hold_trials(hand, qpos[:1], controls[:1])
-    trials = timed("trial", lambda: hold_trials(hand, qpos, controls))
-    commanded = np.isfinite(controls).all(-1)
-    return Arm(candidates, margin, self_penetration(hand, qpos), commanded, trials, seconds)
+    judge = lambda: judged(Surroundings.of(hand), qpos, FORCES, LEAST_CONTACTS, jnp.asarray(MOST * weight))  # noqa: E731
+    judgement = judge()
+    timed("judging", judge)
+    hold_trials(hand, qpos[:1], judgement.controls[:1])
+    trials = timed("trial", lambda: hold_trials(hand, qpos, judgement.controls))
+    return Arm(hand, judgement, trials, seconds)
 
 
-def values_of(arm: Arm, rows: np.ndarray, size: int) -> dict[str, np.ndarray]:
+def values_of(arm: Arm, rows: np.ndarray, starts: int) -> dict[str, np.ndarray]:
     """Every metric of some grasps, and what else might tell those that hold from others."""
-    few, values = arm.candidates.take(rows), {}
+    found, values = arm.judgement, {}
     # Filled up to one size for all arms, so that programs are compiled once for a hand.
-    filled = arm.candidates.take(np.resize(rows, size)) if len(rows) else few
+    filled = candidates_of(arm.hand, found.qpos[np.resize(rows, starts)], source="").take(np.arange(JUDGED))
+    few = filled.take(np.arange(len(rows)))
     for name, metric in METRICS.items():
         if name != LEFT_OUT:
             values[name] = score(filled if metric.batched else few, name, FORCES)[: len(rows)]
-    own = {"contacts": few.columns["touching"], "penetration": few.columns["penetration"]}
-    return values | own | {"self-penetration": arm.self_penetration[rows]}
+    names = {"contacts": "touching", "penetration": "penetration", "self-penetration": "self_penetration"}
+    return values | {name: getattr(found, of)[rows] for name, of in names.items()}
 
 
 def areas(arms: dict[str, list[Arm]], starts: int, resamples: int) -> tuple[list[list[str]], list[str]]:
     """AUC by metric of squeezed grasps, of all and of those that are fine, and how many there are.
 
-    Of each arm as many as there are synthesised ones, the first.
+    Of each arm the first `JUDGED`.
     """
-    every = [(label, arm, np.flatnonzero(arm.commanded)[:starts]) for label, list_ in arms.items() for arm in list_]
+    every = [(label, arm, np.flatnonzero(arm.commanded)[:JUDGED]) for label, list_ in arms.items() for arm in list_]
+    every = [(label, arm, rows) for label, arm, rows in every if len(rows)]
     parts = [values_of(arm, rows, starts) for _, arm, rows in every]
     values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     held = np.concatenate([arm.trials.held[rows] for _, arm, rows in every])
@@ -228,10 +203,10 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
             "Starts are synthesised by `synthesize_hand_grasps`, or random: `sample_configurations`, with fingers "
             "closed on an object that is turned and shifted at random; of these there are more where few have what is "
             f"wanted. Wanted are at least {LEAST_CONTACTS} contacts, "
-            f"no more than {1e3 * DEEPEST:g} mm of penetration (hand and object by `HandGrasps`, the hand in itself by "
-            "MuJoCo) and a positive margin (21) under six unit forces with the object's weight borne and the "
-            f"actuators' limits kept. Squeeze commands of both are those of (22) for {SHARE:.0%} of the margin, "
-            f"but for no more than {MOST:g} times the object's weight. `hold_trials` squeezes in C MuJoCo, lets "
+            f"no more than {1e3 * DEEPEST:g} mm of penetration (of hand and object, and of the hand with itself) "
+            "and a positive margin (21) under six unit forces with the object's weight borne and the "
+            f"actuators' limits kept. Squeeze commands of both are those of (22) for {MOST:g} times the object's "
+            f"weight, or for {SHARE:.0%} of the margin where that is less. `hold_trials` squeezes in C MuJoCo, lets "
             "gravity act and pushes along +-x, +-y, +-z with the object's weight; held is what stays in all of it. "
             "Shares are in per cent with 95 % intervals (Wilson)."
         ),
@@ -257,7 +232,7 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
         wrapped(
             f"Area under the ROC curve of each metric, with 95 % bootstrap intervals ({resamples} resamples), pairs on "
             f"the same object alone: of all grasps with squeeze commands, both kinds together, of each and on each "
-            f"object the first {starts}; and of those of them with all three. {LEFT_OUT} is left to its bound."
+            f"object the first {JUDGED}; and of those of them with all three. {LEFT_OUT} is left to its bound."
         ),
         "",
     ]
@@ -271,13 +246,13 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
     for (hand, object), arms in results.items():
         for name, arm in arms.items():
             s = arm.seconds
-            count = len(arm.margin)
-            warm = [f"{1e3 * s[p] / count:.2f}" for p in ("search", "contacts", "margin (21)", "squeeze (22)")]
+            count = len(arm.fine)
+            warm = [f"{1e3 * s[p] / count:.2f}" for p in ("search", "judging")]
             trial = f"{1e3 * s['trial'] / max(1, arm.commanded.sum()):.0f}"
             rates = [f"{count / s['search']:.0f}", f"{arm.fine.sum() / s['search']:.1f}"]
             rows.append([hand, object, name, *rates, f"{s['search, first'] - s['search']:.1f}", *warm, trial])
     header = ["hand", "object", "starts", "starts a second", "with all three a second", "first run longer by, s"]
-    header += [f"{part}, ms a start" for part in ("search", "contacts", "margin (21)", "squeeze (22)")]
+    header += ["search, ms a start", "of it judging"]
     lines += table([*header, "trial, ms a squeezed grasp"], rows)
     lines += [
         "",
@@ -290,7 +265,7 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="an eighth of the starts, and nothing is written")
+    parser.add_argument("--quick", action="store_true", help="fewer starts, and nothing is written")
     quick = parser.parse_args().quick
     starts, resamples, begun = (QUICK_STARTS, 200, time.time()) if quick else (STARTS, 2000, time.time())
     results: dict[tuple[str, str], dict[str, Arm]] = {}
@@ -301,9 +276,9 @@ def main() -> None:
                 hand, arms = HandObject.from_mjcf(scene(object), "object"), {}
                 for name in (SYNTHESISED, RANDOM):
                     count = starts * MORE[hand_name] if name == RANDOM else starts
-                    arms[name] = measure(name, hand, count, seed)
+                    arms[name] = measure(name, hand, count, seed, starts)
                     told = ", ".join(f"{what} {share}" for what, share in shares(arms[name]).items())
-                    progress.console.print(f"{hand_name}, {object}, {name}: {told}")
+                    progress.console.print(f"{hand_name}, {object}, {name}: {told}; {arms[name].seconds}")
                     progress.advance(task)
                 results[hand_name, object] = arms
     answer = text(results, starts, resamples, (time.time() - begun) / 60)

@@ -12,8 +12,8 @@ from jaxgrasp.simulation.rollouts import Lanes, Pose, Rollouts, Stage, distances
 
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 """Of the pushes, world frame."""
-# Grasps at a time: with six pushes each some 50 MB.
-_TILE = 128
+# Grasps at a time: with six pushes each some 100 MB.
+_TILE = 256
 # s. Commands rise slowly enough that fingers press, not strike; loads so that the object is not set swinging.
 _SQUEEZE, _LOAD = Stage(rise=0.3, seconds=0.6), Stage(rise=0.1, seconds=0.5)
 # Farther than this, m, or turned by more, rad, the object has not stayed.

@@ -20,7 +20,7 @@ DEEPEST, LEAST_MARGIN = 2e-3, 1e-4
 # Of its margin, up to which a grasp can be squeezed.
 SHARE = 0.9
 # Grasps at a time.
-_TILE = 512
+_TILE = 256
 
 
 class Verdict(enum.IntEnum):
