@@ -195,7 +195,7 @@ def test_a_fixed_object_is_approached_by_a_free_hand(hand):
 def test_self_distances_are_those_of_mujoco(hand):
     model, random = hand.model, np.random.default_rng(4)
     geoms = np.array([g for g in hand.touching_geoms if model.geom(g).name != "object"])
-    found = self_pairs(model, hand.joints, geoms)
+    found = self_pairs(model, hand.joints, hand.moved_bodies, geoms)
     qpos = np.tile(model.qpos0, (20, 1))
     qpos[:, model.jnt_qposadr[hand.joints]] = random.uniform(*model.jnt_range[hand.joints].T, (20, len(hand.joints)))
     distances = np.asarray(found.distances(hand.kinematics.poses(jnp.asarray(qpos).T)))[1:]

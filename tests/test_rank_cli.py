@@ -13,9 +13,8 @@ import pyarrow.parquet
 import pytest
 
 from jaxgrasp.candidates import sample_grasps
-from jaxgrasp.cli import main
+from jaxgrasp.cli import main, setting
 from jaxgrasp.cli import rank as rank_command
-from jaxgrasp.cli import setting
 from jaxgrasp.solvers.status import Status
 
 YCB = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "ycb_allegro_grasps.npz"

@@ -16,7 +16,7 @@ _SHORTEST = 1e-6
 # Parts are flat where one of the two shorter half widths is below this share of the other.
 _FLAT = 0.5
 # Random configurations to see which parts can meet, and how near counts, m.
-_CONFIGURATIONS, _NEAR = 300, 0.01
+_CONFIGURATIONS, _NEAR = 300, 0.005
 # The x, y or z axis of a geom, to be turned to z.
 _TURNS = {0: ((0, 0, 1), (0, 1, 0), (-1, 0, 0)), 1: ((1, 0, 0), (0, 0, 1), (0, -1, 0)), 2: np.eye(3)}
 
@@ -50,19 +50,21 @@ class SelfPairs:
         return jnp.concatenate(found)
 
 
-def self_pairs(model: mujoco.MjModel, joints: np.ndarray, geoms: np.ndarray) -> SelfPairs:
+def self_pairs(model: mujoco.MjModel, joints: np.ndarray, moved: np.ndarray, geoms: np.ndarray) -> SelfPairs:
     """Finds which parts of a hand can run into each other.
 
     MuJoCo's masks do not tell: they are set so that what need not be simulated is left out (the fingertips of the
     Shadow Hand pass through each other there). So all pairs count, but for parts of one body or of two bodies with
-    one joint between them, those that overlap in the reference configuration already, and those that come nowhere near
-    each other in random configurations. Boxes are themselves; all else becomes the capsule along its longest side,
-    whose radius is the mean of its other two half widths, or, where it is flat, the box around it.
+    one joint between them or none that is to be moved, those that overlap in the reference configuration already, and
+    those that come nowhere near each other in random configurations. Boxes are themselves; all else becomes the capsule
+    along its longest side, whose radius is the mean of its other two half widths, or, where it is flat, the box around
+    it.
 
     Args:
         model: The scene.
-        joints: The hand's.
-        geoms: Its geoms that count.
+        joints: Those of the hand that are to be moved.
+        moved: (bodies, joints), bool: which of them move a body.
+        geoms: Geoms of the hand that count.
     """
     kinds, sizes, centres, turns = zip(*[_part(model, geom) for geom in geoms], strict=True)
     bodies, turned = model.geom_bodyid[geoms], matrices(model.geom_quat[geoms])
@@ -70,10 +72,12 @@ def self_pairs(model: mujoco.MjModel, joints: np.ndarray, geoms: np.ndarray) -> 
         (a, b) if kinds[a] != "box" else (b, a)
         for a in range(len(geoms))
         for b in range(a)
-        if not _neighbours(model, int(bodies[a]), int(bodies[b]))
+        if not _neighbours(model, int(bodies[a]), int(bodies[b])) and (moved[bodies[a]] != moved[bodies[b]]).any()
     ]
     found: dict[tuple[str, str], list[tuple[int, int]]] = {}
-    for pair, meets in zip(candidates, _meet(model, joints, geoms[np.array(candidates, int)]), strict=True):
+    for pair, meets in zip(
+        candidates, _meet(model, joints, geoms[np.array(candidates, int).reshape(-1, 2)]), strict=True
+    ):
         if meets:
             found.setdefault((kinds[pair[0]], kinds[pair[1]]), []).append(pair)
     return SelfPairs(

@@ -78,7 +78,8 @@ class Surroundings:
             raise ValueError("links: got none, wanted at least one body of the hand")
         self.free_joint, self.moves_object = _free_joint(hand)
         geoms = np.setdiff1d(hand.touching_geoms, self._object_geoms)
-        self.self_pairs: SelfPairs = self_pairs(model, hand.joints, geoms)
+        joints = self.joints
+        self.self_pairs: SelfPairs = self_pairs(model, hand.joints[joints], hand.moved_bodies[:, joints], geoms)
 
     @property
     def pose(self) -> int:
