@@ -6,13 +6,17 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax import lax
 
+from jaxgrasp.arrays import fold, safe_divide, safe_norm
 from jaxgrasp.geometry.pairs import Geom, touch
 from jaxgrasp.hands.kinematics import Poses, matrices, place
 
 _BOX, _SPHERE, _CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("BOX", "SPHERE", "CAPSULE"))
 # A capsule needs some length for its axis to have a direction, m.
 _SHORTEST = 1e-6
+# Rounds in which the nearest point of a capsule's axis to a box is sought: each leaves two thirds of it.
+_THIRDS = 14
 # Parts are flat where one of the two shorter half widths is below this share of the other.
 _FLAT = 0.5
 # Random configurations to see which parts can meet, and how near counts, m.
@@ -46,8 +50,56 @@ class SelfPairs:
         found = [jnp.full((1, *lanes), jnp.inf, dtype)]
         for kinds, pairs in self.pairs.items():
             one, other = (Geom(positions[:, of], rotations[:, :, of], sizes[:, of]) for of in pairs)
-            found.append(touch(*kinds, one, other).distance.min(0))
+            found.append(_DISTANCES[kinds](one, other))
         return jnp.concatenate(found)
+
+
+def _capsules(a: Geom, b: Geom) -> jax.Array:
+    half_a, half_b = a.rotation[:, 2] * a.size[1], b.rotation[:, 2] * b.size[1]
+    apart = a.position - b.position
+
+    # How a distance changes does not depend on how its points move along the parts: these count as constant.
+    aa, ab, bb = _dot(half_a, half_a), _dot(half_a, half_b), _dot(half_b, half_b)
+    u, v = _dot(half_a, apart), _dot(half_b, apart)
+    determinant = aa * bb - ab * ab
+    x = jnp.clip(safe_divide(ab * v - bb * u, determinant), -1, 1)
+    y = jnp.clip((ab * x + v) / bb, -1, 1)
+    x, y = (lax.stop_gradient(z) for z in (jnp.clip((ab * y - u) / aa, -1, 1), y))
+    return safe_norm(apart + x * half_a - y * half_b, 0) - a.size[0] - b.size[0]
+
+
+def _capsule_and_box(a: Geom, b: Geom) -> jax.Array:
+    turned = lambda vector: fold(jnp.add, [b.rotation[i] * vector[i] for i in range(3)])  # noqa: E731
+    centre, half = turned(a.position - b.position), turned(a.rotation[:, 2] * a.size[1])
+
+    def distance(at: jax.Array, centre: jax.Array, half: jax.Array) -> jax.Array:
+        beyond = jnp.abs(centre + at * half) - b.size
+        return safe_norm(jnp.maximum(beyond, 0), 0) + jnp.minimum(fold(jnp.maximum, beyond), 0)
+
+    fixed = lax.stop_gradient((centre, half))
+
+    def shorten(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        low, high = ends
+        first, second = (2 * low + high) / 3, (low + 2 * high) / 3
+        left = distance(first, *fixed) < distance(second, *fixed)
+        return jnp.where(left, low, first), jnp.where(left, second, high)
+
+    # The distance from a box is convex along the capsule's axis.
+    start = -jnp.ones_like(centre[0]), jnp.ones_like(centre[0])
+    low, high = lax.fori_loop(0, _THIRDS, shorten, start)
+    return distance(0.5 * (low + high), centre, half) - a.size[0]
+
+
+def _boxes(a: Geom, b: Geom) -> jax.Array:
+    return touch("box", "box", a, b).distance.min(0)
+
+
+_DISTANCES = {("capsule", "capsule"): _capsules, ("capsule", "box"): _capsule_and_box, ("box", "box"): _boxes}
+
+
+def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Of vectors (3, ...), one a lane."""
+    return fold(jnp.add, a * b)
 
 
 def self_pairs(model: mujoco.MjModel, joints: np.ndarray, moved: np.ndarray, geoms: np.ndarray) -> SelfPairs:
