@@ -1,7 +1,7 @@
-"""Do synthesised grasps of real hands hold? `python -m benchmarks.hand_synthesis [--quick]`.
+"""Do synthesised grasps of real hands hold? `python -m benchmarks.hand_synthesis [hand ...] [--quick]`.
 
 Grasps by gradient and random ones, closed without optimisation, are squeezed by the same rule and tried in C MuJoCo:
-squeeze, gravity, six pushes. Writes hand_synthesis.md beside this file.
+squeeze, gravity, six pushes. Writes hand_synthesis_HAND.md beside this file, for each hand.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from jaxgrasp.simulation import Trials, hold_trials  # noqa: E402
 from jaxgrasp.synthesis import Verdict, synthesize_hand_grasps  # noqa: E402
 from jaxgrasp.synthesis.hand_judgement import DEEPEST, LEAST_MARGIN, SHARE, Judgement, judged  # noqa: E402
 
-HANDS = {"Shadow Hand": shadow_hand, "four fingers": four_fingers}
+HANDS = {"shadow_hand": shadow_hand, "four_fingers": four_fingers}
 OBJECTS = ("sphere", "box", "capsule", "cylinder", "mesh")
 STARTS, QUICK_STARTS = 256, 96
-MORE = {"Shadow Hand": 4, "four fingers": 1}
+MORE = {"shadow_hand": 4, "four_fingers": 1}
 """So many times as many random starts: of one in fifty the Shadow Hand's fingers are not inside each other."""
 SYNTHESISED, RANDOM = "synthesised", "random, closed"
 JUDGED = 96
@@ -195,9 +195,9 @@ def wrapped(words: str) -> str:
     return textwrap.fill(words, 120)
 
 
-def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples: int, minutes: float) -> str:
+def text(hand: str, results: dict[str, dict[str, Arm]], starts: int, resamples: int, minutes: float) -> str:
     lines = [
-        "# Do synthesised grasps of real hands hold?",
+        f"# Do synthesised grasps of `{hand}` hold?",
         "",
         wrapped(
             "Starts are synthesised by `synthesize_hand_grasps`, or random: `sample_configurations`, with fingers "
@@ -213,20 +213,20 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
         "",
     ]
     rows = []
-    for (hand, object), arms in results.items():
+    for object, arms in results.items():
         for name, arm in arms.items():
             checks = [f"{100 * check.mean():.0f}" for check in arm.checks.values()]
             gravity = Share(int((arm.fine & arm.trials.held_gravity).sum()), int(arm.fine.sum()))
             of_all, held, both = map(str, shares(arm).values())
-            rows.append([hand, object, name, *checks, of_all, str(gravity), held, both])
+            rows.append([object, name, *checks, of_all, str(gravity), held, both])
     checks = list(next(iter(next(iter(results.values())).values())).checks)
-    header = ["hand", "object", "starts", *checks, "all three", "of these held under gravity", "held", "three and held"]
+    header = ["object", "starts", *checks, "all three", "of these held under gravity", "held", "three and held"]
     lines += table(header, rows) + ["", "## Are synthesised grasps ahead, with intervals that are disjoint?", ""]
     rows = []
-    for (hand, object), arms in results.items():
+    for object, arms in results.items():
         ours, theirs = (shares(arms[name]) for name in (SYNTHESISED, RANDOM))
-        rows.append([hand, object, *(ours[what].verdict(theirs[what]) for what in ours)])
-    lines += table(["hand", "object", *ours], rows)
+        rows.append([object, *(ours[what].verdict(theirs[what]) for what in ours)])
+    lines += table(["object", *ours], rows)
     lines += ["", "## What tells grasps that hold from others?", ""]
     lines += [
         wrapped(
@@ -236,28 +236,26 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
         ),
         "",
     ]
-    for hand in HANDS:
-        of_hand = {object: list(arms.values()) for (h, object), arms in results.items() if h == hand}
-        rows, told = areas(of_hand, starts, resamples)
-        header = ["metric", f"AUC, squeezed ({told[0]} hold)", f"AUC, with all three ({told[1]} hold)"]
-        lines += [f"{hand}:", "", *table(header, rows), ""]
+    of_hand = {object: list(arms.values()) for object, arms in results.items()}
+    rows, told = areas(of_hand, starts, resamples)
+    header = ["metric", f"AUC, squeezed ({told[0]} hold)", f"AUC, with all three ({told[1]} hold)"]
+    lines += [*table(header, rows), ""]
     lines += ["## How fast, and where the time goes", ""]
     rows = []
-    for (hand, object), arms in results.items():
-        for name, arm in arms.items():
-            s = arm.seconds
-            count = len(arm.fine)
-            warm = [f"{1e3 * s[p] / count:.2f}" for p in ("search", "judging")]
-            trial = f"{1e3 * s['trial'] / max(1, arm.commanded.sum()):.0f}"
-            rates = [f"{count / s['search']:.0f}", f"{arm.fine.sum() / s['search']:.1f}"]
-            rows.append([hand, object, name, *rates, f"{s['search, first'] - s['search']:.1f}", *warm, trial])
-    header = ["hand", "object", "starts", "starts a second", "with all three a second", "first run longer by, s"]
-    header += ["search, ms a start", "of it judging"]
-    lines += table([*header, "trial, ms a squeezed grasp"], rows)
+    for object, arms in results.items():
+        arm = arms[SYNTHESISED]
+        s, count = arm.seconds, len(arm.fine)
+        rates = [f"{count / s['search']:.0f}", f"{arm.fine.sum() / s['search']:.0f}"]
+        warm = [f"{1e3 * s[part] / count:.2f}" for part in ("search", "judging")]
+        trial = f"{1e3 * s['trial'] / max(1, arm.commanded.sum()):.0f}"
+        rows.append([object, *rates, f"{s['search, first'] - s['search']:.0f}", *warm, trial])
+    header = ["object", "starts a second", "good ones a second", "compiling, s", "search, ms a start"]
+    lines += table([*header, "of it judging, once of twice", "trial, ms a grasp"], rows)
     lines += [
         "",
         f"{minutes:.0f} min on {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}, jax "
-        f"{jax.__version__}, mujoco {mujoco.__version__}, float64. Made by `python -m benchmarks.hand_synthesis`.",
+        f"{jax.__version__}, mujoco {mujoco.__version__}, float64, load average {os.getloadavg()[0]:.1f} in the end. "
+        f"Made by `python -m benchmarks.hand_synthesis {hand}`.",
         "",
     ]
     return "\n".join(lines)
@@ -266,25 +264,29 @@ def text(results: dict[tuple[str, str], dict[str, Arm]], starts: int, resamples:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer starts, and nothing is written")
-    quick = parser.parse_args().quick
+    parser.add_argument("hands", nargs="*", help=f"{', '.join(HANDS)}; all of them where none is given")
+    given = parser.parse_args()
+    quick, hands = given.quick, given.hands or list(HANDS)
+    if not set(hands) <= set(HANDS):
+        parser.error(f"hands: got {hands}, wanted some of {', '.join(HANDS)}")
     starts, resamples, begun = (QUICK_STARTS, 200, time.time()) if quick else (STARTS, 2000, time.time())
-    results: dict[tuple[str, str], dict[str, Arm]] = {}
-    with Progress() as progress:
-        task = progress.add_task("grasping", total=2 * len(HANDS) * len(OBJECTS))
-        for hand_name, scene in HANDS.items():
+    for hand_name in hands:
+        results: dict[str, dict[str, Arm]] = {}
+        with Progress() as progress:
+            task = progress.add_task(f"grasping with {hand_name}", total=2 * len(OBJECTS))
             for seed, object in enumerate(OBJECTS):
-                hand, arms = HandObject.from_mjcf(scene(object), "object"), {}
+                hand, arms = HandObject.from_mjcf(HANDS[hand_name](object), "object"), {}
                 for name in (SYNTHESISED, RANDOM):
                     count = starts * MORE[hand_name] if name == RANDOM else starts
                     arms[name] = measure(name, hand, count, seed, starts)
                     told = ", ".join(f"{what} {share}" for what, share in shares(arms[name]).items())
-                    progress.console.print(f"{hand_name}, {object}, {name}: {told}; {arms[name].seconds}")
+                    progress.console.print(f"{hand_name}, {object}, {name}: {told}")
                     progress.advance(task)
-                results[hand_name, object] = arms
-    answer = text(results, starts, resamples, (time.time() - begun) / 60)
-    if not quick:
-        (Path(__file__).parent / "hand_synthesis.md").write_text(answer)
-    print(answer)
+                results[object] = arms
+        answer = text(hand_name, results, starts, resamples, (time.time() - begun) / 60)
+        if not quick:
+            (Path(__file__).parent / f"hand_synthesis_{hand_name}.md").write_text(answer)
+        print(answer)
 
 
 if __name__ == "__main__":
