@@ -152,7 +152,7 @@ def test_coupled_joints_move_as_in_mujoco():
     hand, qpos, grasps = small("coupled")
     model = hand.model
     assert hand.joint_names == ("b",)
-    moved = np.asarray(hand._couplings.velocities(qpos[:, model.jnt_qposadr[hand.joints]]))
+    moved = np.asarray(hand.couplings.velocities(qpos[:, model.jnt_qposadr[hand.joints]]))
     data = mujoco.MjData(model)
     for lane in range(COUNT):
         # On the constraints, where C linearises them.

@@ -13,7 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from jaxgrasp.candidates import sample_grasps
-from jaxgrasp.cli import main
+from jaxgrasp.cli import main, setting
 from jaxgrasp.cli import rank as rank_command
 from jaxgrasp.solvers.status import Status
 
@@ -218,3 +218,14 @@ def test_real_grasps(here, capsys):
     printed = capsys.readouterr().out
     assert "058_golf_ball" in printed and "292 SOLVED (292 with a margin above zero), 3 INFEASIBLE" in printed
     assert (here / "ranking.parquet").exists() and (here / "ranking.png").exists()
+
+
+def test_programs_are_kept_where_nobody_else_writes(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = setting._folder_of_programs()
+    assert folder is not None and folder.is_relative_to(tmp_path / "jaxgrasp" / "programs")
+    folder.chmod(0o777)
+    assert setting._folder_of_programs() is None
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    (tmp_path / "file").write_text("no folder")
+    assert setting._folder_of_programs() is None

@@ -12,6 +12,20 @@ class CommandError(Exception):
     exit_code = 2
 
 
+def check_options(*checks: tuple[str, object, bool, str]) -> None:
+    """Refuses values that cannot be used.
+
+    Args:
+        checks: Option, value, whether it can be used, and what is wanted.
+
+    Raises:
+        CommandError: One of them, the first, cannot be used.
+    """
+    for option, value, admissible, wanted in checks:
+        if not admissible:
+            raise CommandError(f"{option}: got {value}; wanted {wanted}")
+
+
 def check_output(path: Path, option: str, endings: Sequence[str], inputs: Sequence[Path]) -> None:
     """Finds out whether a file can be written, and leaves everything as it was.
 

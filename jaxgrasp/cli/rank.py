@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli.metrics import metric_names, scores_of
-from jaxgrasp.cli.problems import CommandError, check_output, write_files
+from jaxgrasp.cli.problems import CommandError, check_options, check_output, write_files
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
@@ -102,17 +102,14 @@ class Rank:
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
 
-        checks = [
+        check_options(
             ("--friction", self.friction, self.friction is None or 0.0 <= self.friction < math.inf, "a number >= 0"),
             ("--max-force", self.max_force, self.max_force is None or 0.0 < self.max_force < math.inf, "newtons > 0"),
             ("--gravity", self.gravity, math.isfinite(self.gravity), "a finite number of m/s^2"),
             ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
             ("--share", self.share, 0.0 < self.share <= 1.0, "a number in (0, 1]"),
             ("--top", self.top, self.top >= 0, "a number >= 0"),
-        ]
-        for option, value, admissible, wanted in checks:
-            if not admissible:
-                raise CommandError(f"{option}: got {value}; wanted {wanted}")
+        )
         if self.prune and self.metric:
             raise CommandError("--prune: got --metric, too; wanted a ranking by the margin alone")
         self.of_hand.check()

@@ -17,7 +17,7 @@ from jaxgrasp.ranking import MetricComparison, Ranking
 from jaxgrasp.solvers.status import Status
 
 if TYPE_CHECKING:
-    from jaxgrasp.synthesis import Record, Synthesis
+    from jaxgrasp.synthesis import HandSynthesis, Record, Synthesis
 
 _ROWS = 20
 _TEXT_COLUMNS = 2
@@ -106,6 +106,62 @@ def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
             progress.update(task, completed=done, description=text)
 
         yield show
+
+
+@contextlib.contextmanager
+def hand_bar(starts: int, steps: int) -> Iterator[Callable[[int, int, dict[str, np.ndarray]], None]]:
+    """Shows a bar on standard error where that is a terminal, with the energy's terms in the median.
+
+    Args:
+        starts: How many starts there are.
+        steps: Of each.
+
+    Yields:
+        What to call with the numbers of steps done and to be done, over all batches of starts, and the record.
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("compiling", total=steps)
+
+        def show(done: int, total: int, record: dict[str, np.ndarray]) -> None:
+            middle = ", ".join(f"{name} {rows[-1, rows.shape[1] // 2]:.2f}" for name, rows in record.items())
+            text = middle.replace("_", "-") if done < total else f"closing fingers and judging {starts:,} grasps"
+            progress.update(task, completed=done, total=total, description=text)
+
+        yield show
+
+
+def print_hand_synthesis(found: "HandSynthesis", kept: int, name: str, unit: str, written: Sequence[Path]) -> None:
+    """Prints what a synthesis with a hand found to standard output.
+
+    Args:
+        found: The grasps.
+        kept: How many of them were to be written.
+        name: What the hand and the object are called.
+        unit: Unit of the margin.
+        written: The files that were written.
+    """
+    from jaxgrasp.synthesis import Verdict
+
+    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
+    verdicts = [
+        verdict for verdict in Verdict if (found.verdict == verdict).any() or (found.first_verdict == verdict).any()
+    ]
+    table = Table(title=f"{len(found.margin):,} grasps of {escape(name)}")
+    quantiles = [f"margin of good ones [{unit}]: median", "best"]
+    for column in ("", *(verdict.name.lower().replace("_", " ") for verdict in verdicts), *quantiles):
+        table.add_column(escape(column), justify="right" if column else "left")
+    for label, verdict, margin in (
+        ("random starts, closed", found.first_verdict, found.first_margin),
+        ("synthesised", found.verdict, found.margin),
+    ):
+        good = margin[verdict == Verdict.GOOD]
+        shares = [f"{(verdict == each).mean():.1%}" for each in verdicts]
+        table.add_row(label, *shares, *([f"{np.median(good):.4g}", f"{good.max():.4g}"] if len(good) else ["", ""]))
+    console.print(table)
+    if written:
+        console.print(f"written: {', '.join(map(str, written))} ({kept:,} grasps)", markup=False)
 
 
 def print_synthesis(found: "Synthesis", name: str, note: str, unit: str, written: Sequence[Path]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxgrasp.cli.problems import CommandError
+from jaxgrasp.cli.problems import CommandError, check_options
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -21,16 +21,11 @@ _PICTURES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
-    """A hand and an object, whose candidates are configurations."""
+class HandScene:
+    """A hand and an object."""
 
     scene: str | None = None
-    """Rank configurations of a hand: an MJCF file with a hand and an object, or shadow_hand or four_fingers, which come
-    with the package. The weight in the scene's gravity must be borne."""
-
-    qpos: Path | None = None
-    """Configurations: .npy (N, nq), or .npz with the field qpos; other columns travel along. None samples them around
-    the scene's own: the object turned and moved, the fingers closed until they touch."""
+    """A hand and an object in MJCF: a file, or shadow_hand or four_fingers, which come with the package."""
 
     object_body: str = "object"
     """The object's body in the scene."""
@@ -38,26 +33,11 @@ class Scene:
     object_shape: str = "sphere"
     """The object of a scene that comes with the package: sphere, capsule, box, cylinder, ellipsoid, mesh, or a FILE."""
 
-    samples: int = SAMPLED
-    """How many configurations to sample."""
-
-    seed: int = 0
-    """Of the samples."""
-
     contact_distance: float = 1e-3
     """Geoms no farther apart than this touch, m."""
 
     max_contacts: int = 8
     """How many contacts a grasp keeps, the nearest ones."""
-
-    min_contacts: int = 2
-    """Leave out configurations with fewer contacts."""
-
-    max_penetration: float = 0.002
-    """Leave out configurations in which hand and object are deeper in each other, m."""
-
-    actuators: bool = True
-    """Whether the limits of the hand's actuators count; else every contact may push with --max-force."""
 
     picture: Path | None = Path("hands.png")
     """The rendered picture of the best configurations to write, .png; None for none."""
@@ -68,20 +48,15 @@ class Scene:
         Raises:
             CommandError: An option cannot be used.
         """
-        if self.scene is None:
-            if self.qpos is not None:
-                raise CommandError("--qpos: got a file without --scene; wanted the scene that it is for, too")
-            return
-        checks = [
-            ("--samples", self.samples, self.samples >= 1, "at least 1"),
+        check_options(
             ("--contact-distance", self.contact_distance, 0.0 <= self.contact_distance < math.inf, "metres >= 0"),
             ("--max-contacts", self.max_contacts, self.max_contacts >= 1, "at least 1"),
-            ("--min-contacts", self.min_contacts, self.min_contacts >= 0, "a number >= 0"),
-            ("--max-penetration", self.max_penetration, self.max_penetration >= 0.0, "metres >= 0"),
-        ]
-        for option, value, admissible, wanted in checks:
-            if not admissible:
-                raise CommandError(f"{option}: got {value}; wanted {wanted}")
+        )
+
+    @property
+    def built_in(self) -> bool:
+        """Whether the scene comes with the package."""
+        return self.scene in BUILT_IN
 
     def hand(self, friction: float | None, max_force: float | None) -> "HandObject":
         """Reads the scene.
@@ -97,7 +72,7 @@ class Scene:
 
         assert self.scene is not None
         try:
-            given = getattr(scenes, self.scene)(self.object_shape) if self.scene in BUILT_IN else Path(self.scene)
+            given = getattr(scenes, self.scene)(self.object_shape) if self.built_in else Path(self.scene)
             return HandObject.from_mjcf(
                 given,
                 self.object_body,
@@ -108,6 +83,51 @@ class Scene:
             )
         except (ValueError, OSError) as error:
             raise CommandError(f"--scene {self.scene}: {' '.join(str(error).split())}") from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(HandScene):
+    """A hand and an object, whose candidates are configurations."""
+
+    scene: str | None = None
+    """Rank configurations of a hand: an MJCF file with a hand and an object, or shadow_hand or four_fingers, which come
+    with the package. The weight in the scene's gravity must be borne."""
+
+    qpos: Path | None = None
+    """Configurations: .npy (N, nq), or .npz with the field qpos; other columns travel along. None samples them around
+    the scene's own: the object turned and moved, the fingers closed until they touch."""
+
+    samples: int = SAMPLED
+    """How many configurations to sample."""
+
+    seed: int = 0
+    """Of the samples."""
+
+    min_contacts: int = 2
+    """Leave out configurations with fewer contacts."""
+
+    max_penetration: float = 0.002
+    """Leave out configurations in which hand and object are deeper in each other, m."""
+
+    actuators: bool = True
+    """Whether the limits of the hand's actuators count; else every contact may push with --max-force."""
+
+    def check(self) -> None:
+        """Finds what cannot be used before any long work.
+
+        Raises:
+            CommandError: An option cannot be used.
+        """
+        if self.scene is None:
+            if self.qpos is not None:
+                raise CommandError("--qpos: got a file without --scene; wanted the scene that it is for, too")
+            return
+        super().check()
+        check_options(
+            ("--samples", self.samples, self.samples >= 1, "at least 1"),
+            ("--min-contacts", self.min_contacts, self.min_contacts >= 0, "a number >= 0"),
+            ("--max-penetration", self.max_penetration, self.max_penetration >= 0.0, "metres >= 0"),
+        )
 
     def candidates(self, hand: "HandObject") -> "Candidates":
         """Reads or samples the configurations, finds their contacts and leaves out what the options say.

@@ -1,12 +1,15 @@
 """`jaxgrasp synthesize`: an object in, a file of candidates and a figure out."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from jaxgrasp.cli.problems import CommandError, check_output, write_files
+import tyro
+
+from jaxgrasp.cli.problems import CommandError, check_options, check_output, write_files
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
+from jaxgrasp.cli.synthesize_hand import SceneSynthesis
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,6 +17,7 @@ if TYPE_CHECKING:
     from jaxgrasp.geometry import Shape
     from jaxgrasp.synthesis import Synthesis
 
+_SIZE, _FRICTION = 0.1, 0.6
 BUILT_IN = ("sphere", "ellipsoid", "box", "capsule", "cylinder", "superquadric")
 
 
@@ -22,14 +26,15 @@ class Synthesize:
     """Make grasps of an object by gradient ascent on the largest disturbance that they resist.
 
     Contacts begin at random places on the surface and move along it. Writes an .npz file of candidates that `jaxgrasp
-    rank` reads: positions about the centre of mass, outward_normals, friction, max_force, the best first.
+    rank` reads: positions about the centre of mass, outward_normals, friction, max_force, the best first. With --scene
+    a whole hand moves, its pose and its joints, and the file has configurations for `jaxgrasp rank --scene --qpos`.
     """
 
     object: str = "superquadric"
     """sphere, ellipsoid, box, capsule, cylinder or superquadric; or a mesh FILE, .stl, .obj or .ply."""
 
-    size: float = 0.1
-    """Longest side of a built-in object, m."""
+    size: float | None = None
+    """Longest side of a built-in object, m; None for 0.1."""
 
     scale: float = 1.0
     """Metres per unit of the mesh file."""
@@ -37,8 +42,8 @@ class Synthesize:
     contacts: int = 4
     """Contacts of each grasp."""
 
-    friction: float = 0.6
-    """Coulomb's friction coefficient."""
+    friction: float | None = None
+    """Coulomb's friction coefficient; None for 0.6, with --scene for the scene's."""
 
     max_force: float = 10.0
     """Largest normal force, N."""
@@ -72,6 +77,8 @@ class Synthesize:
     figure: Path | None = Path("synthesis.png")
     """The figure to write, .png, .svg or .pdf; None for no figure."""
 
+    of_hand: Annotated[SceneSynthesis, tyro.conf.arg(name="")] = field(default_factory=SceneSynthesis)
+
     def run(self) -> int:
         """Synthesises, writes and prints.
 
@@ -87,8 +94,11 @@ class Synthesize:
         from jaxgrasp.geometry import MeshError
 
         try:
-            shape, centre, name, note = self._object()
             disturbances, unit = named_disturbances(self.disturbances)
+            if self.of_hand.scene:
+                names = ("friction", "max_force", "starts", "steps", "seed", "output", "figure")
+                return self.of_hand.run(disturbances, unit, **{name: getattr(self, name) for name in names})
+            shape, centre, name, note = self._object()
         except (MeshError, CandidateError) as error:
             raise CommandError(str(error)) from error
         found = self._synthesize(shape, centre, disturbances)
@@ -100,11 +110,11 @@ class Synthesize:
 
     def _check(self) -> None:
         span = math.inf if self.span is None else self.span
-        checks = [
-            ("--size", self.size, 0.0 < self.size < math.inf, "metres > 0"),
+        check_options(
+            ("--size", self.size, self.size is None or 0.0 < self.size < math.inf, "metres > 0"),
             ("--scale", self.scale, 0.0 < self.scale < math.inf, "a number > 0"),
             ("--contacts", self.contacts, self.contacts >= 2, "at least 2"),
-            ("--friction", self.friction, 0.0 < self.friction < math.inf, "a number > 0"),
+            ("--friction", self.friction, self.friction is None or 0.0 < self.friction < math.inf, "a number > 0"),
             ("--max-force", self.max_force, 0.0 < self.max_force < math.inf, "newtons > 0"),
             ("--spacing", self.spacing, 0.0 <= self.spacing < math.inf, "metres >= 0"),
             ("--span", self.span, span > self.spacing, "metres above --spacing"),
@@ -112,11 +122,14 @@ class Synthesize:
             ("--steps", self.steps, self.steps >= 1, "at least 1"),
             ("--seed", self.seed, 0 <= self.seed < 2**32, "from 0 to 2^32 - 1"),
             ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
-        ]
-        for option, value, admissible, wanted in checks:
-            if not admissible:
-                raise CommandError(f"{option}: got {value}; wanted {wanted}")
-        inputs = [Path(self.object), Path(self.disturbances)]
+        )
+        if self.of_hand.scene:
+            self.of_hand.check()
+            if self.size is not None or self.span is not None:
+                raise CommandError("--scene: got --size or --span, too; wanted the scene's own object and hand alone")
+        inputs = [Path(self.object), Path(self.disturbances), Path(self.of_hand.scene or "")]
+        if self.of_hand.scene and self.of_hand.picture is not None:
+            check_output(self.of_hand.picture, "--picture", FIGURE_ENDINGS, inputs)
         check_output(self.output, "--output", (".npz",), inputs)
         if self.figure is not None:
             check_output(self.figure, "--figure", FIGURE_ENDINGS, inputs)
@@ -127,7 +140,7 @@ class Synthesize:
 
         from jaxgrasp import geometry
 
-        half = 0.5 * self.size
+        half = 0.5 * (self.size or _SIZE)
         sides = half * np.array([0.6, 0.45, 1.0])
         built_in = {
             "sphere": lambda: geometry.Sphere.from_radius(half),
@@ -166,7 +179,7 @@ class Synthesize:
                 self.contacts,
                 jax.random.key(self.seed),
                 disturbances=disturbances,
-                friction=self.friction,
+                friction=self.friction or _FRICTION,
                 max_force=self.max_force,
                 starts=self.starts,
                 steps=self.steps,
@@ -192,7 +205,7 @@ class Synthesize:
                 path,
                 positions=found.positions,
                 outward_normals=found.outward_normals,
-                friction=np.full(count, self.friction),
+                friction=np.full(count, self.friction or _FRICTION),
                 max_force=np.full(count, self.max_force),
                 center_of_mass=np.broadcast_to(found.center_of_mass, (count, 3)),
                 object_name=np.full(count, name),
@@ -200,6 +213,8 @@ class Synthesize:
             )
 
         def write_picture(path: Path) -> None:
-            write_figure(figure_of_synthesis(found, surface, friction=self.friction, name=name, unit=unit), path)
+            write_figure(
+                figure_of_synthesis(found, surface, friction=self.friction or _FRICTION, name=name, unit=unit), path
+            )
 
         return write_files((self.output, write_candidates), (self.figure, write_picture))

@@ -50,7 +50,7 @@ class HandObject:
     kinematics: Kinematics
     _table: PairTable
     _actuators: Actuators
-    _couplings: Couplings
+    couplings: Couplings
 
     @classmethod
     def from_mjcf(
@@ -116,7 +116,7 @@ class HandObject:
             kinematics=Kinematics(model),
             _table=pair_table(model, hand, of_object),
             _actuators=read_actuators(model, dofs),
-            _couplings=read_couplings(model, dofs),
+            couplings=read_couplings(model, dofs),
         )
 
     @property
@@ -127,12 +127,17 @@ class HandObject:
     @property
     def joint_names(self) -> tuple[str, ...]:
         """The joints of `HandGrasps.actuation`, in order."""
-        return tuple(self.model.joint(self.joints[i]).name for i in self._couplings.free)
+        return tuple(self.model.joint(self.joints[i]).name for i in self.couplings.free)
 
     @property
     def actuator_names(self) -> tuple[str, ...]:
         """The actuators of `HandGrasps.actuation`, in order."""
-        return tuple(self.model.actuator(a).name for a in self._actuators.numbers)
+        return tuple(self.model.actuator(a).name for a in self.actuators)
+
+    @property
+    def actuators(self) -> np.ndarray:
+        """The numbers of `actuator_names` in the model."""
+        return self._actuators.numbers
 
     @property
     def object_mass(self) -> float:
@@ -142,7 +147,7 @@ class HandObject:
     @property
     def constant_transmission(self) -> bool:
         """Whether actuators pull at the joints in the same way in every configuration."""
-        return self._actuators.transmission is not None and self._couplings.linear
+        return self._actuators.transmission is not None and self.couplings.linear
 
     def grasps(self, qpos: ArrayLike) -> HandGrasps:
         """What the hand does in a batch of configurations.
@@ -214,8 +219,18 @@ class HandObject:
 
     @property
     def slot_links(self) -> np.ndarray:
-        """(slots,), the body of the hand of every point that `approach` looks at."""
+        """(slots,), the body of the hand of every point that `points` looks at."""
         return self._table.link
+
+    @property
+    def slot_friction(self) -> np.ndarray:
+        """(slots,), Coulomb's coefficient of every such point."""
+        return self._table.friction if self.friction is None else np.full(len(self._table.link), self.friction)
+
+    @property
+    def touching_geoms(self) -> np.ndarray:
+        """Numbers of the geoms of hand and object that can touch."""
+        return self._table.geoms
 
     @cached_property
     def moved_bodies(self) -> np.ndarray:
@@ -228,16 +243,27 @@ class HandObject:
     def approach(self, qpos: Float[Array, "n nq"]) -> tuple[Points, Float[Array, "n slots joints"]]:
         """All points where geoms touch or come near, and how fast each joint moves them apart.
 
-        Args:
-            qpos: Configurations.
-
         Returns:
             Points (n, slots, ...), world frame, and d distance / d joint position, m/rad or 1, while the object rests.
         """
         poses = self.kinematics.poses(qpos.T)
-        points = self._slots(poses)
+        points = self.points(poses)
         velocity = self.point_velocities(poses, points.position, self.moved_bodies[self.slot_links])
         return points, jnp.einsum("nsvi,nsi->nsv", velocity, points.normal)
+
+    def frames(self, qpos: Float[Array, "n nq"]) -> tuple[Poses, Array, Array]:
+        """Poses of all bodies, and the object's frame (n, 3, 3) and centre of mass (n, 3), m, world frame."""
+        poses = self.kinematics.poses(qpos.T)
+        return poses, jnp.moveaxis(poses.rotations[:, :, self.object_body], -1, 0), self._mass_centre(poses)
+
+    def points(self, poses: Poses) -> Points:
+        """All points where geoms touch or come near, (n, slots, ...)."""
+        table, model = self._table, self.model
+        bodies, offsets = model.geom_bodyid[table.geoms], model.geom_pos[table.geoms].T
+        rotations, positions = place(
+            poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, matrices(model.geom_quat[table.geoms])
+        )
+        return Points(*[jnp.moveaxis(x, -1, 0) for x in touching_points(table, positions, rotations)])
 
     @cached_property
     def _compiled(self):
@@ -257,9 +283,7 @@ class HandObject:
         """For (n, nq)."""
         admissible = self._admissible(qpos)
         safe = jnp.where(admissible[:, None], qpos, jnp.asarray(self.model.qpos0, qpos.dtype))
-        poses = self.kinematics.poses(safe.T)
-        rotation = jnp.moveaxis(poses.rotations[:, :, self.object_body], -1, 0)
-        centre = self._mass_centre(poses)
+        poses, rotation, centre = self.frames(safe)
         points, friction, links = self._points(poses)
         touching = points.distance <= self.contact_distance
         distances, chosen = lax.top_k(-points.distance, min(self.max_contacts, points.distance.shape[-1]))
@@ -278,7 +302,7 @@ class HandObject:
         )
         gravity = jnp.einsum("nji,j->ni", rotation, jnp.asarray(self.model.opt.gravity, qpos.dtype))
         weight = required_wrench(self.object_mass, gravity=gravity)
-        lengths, actuation, stiffness = self._transmission(safe, poses, world, rotation, contacts.frames, links)
+        lengths, actuation, stiffness = self.transmission(safe, poses, world, rotation, contacts.frames, links)
         return HandGrasps(
             contacts=contacts,
             distances=distances,
@@ -309,18 +333,9 @@ class HandObject:
         centres = place(poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, turns)[1]
         return jnp.einsum("b,ibn->ni", jnp.asarray(masses / masses.sum(), centres.dtype), centres)
 
-    def _slots(self, poses: Poses) -> Points:
-        """Points (n, slots, ...)."""
-        table, model = self._table, self.model
-        bodies, offsets = model.geom_bodyid[table.geoms], model.geom_pos[table.geoms].T
-        rotations, positions = place(
-            poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, matrices(model.geom_quat[table.geoms])
-        )
-        return Points(*[jnp.moveaxis(x, -1, 0) for x in touching_points(table, positions, rotations)])
-
     def _points(self, poses: Poses) -> tuple[Points, np.ndarray, np.ndarray]:
         """Points (n, slots, ...), and friction and link of every slot."""
-        table, points = self._table, self._slots(poses)
+        table, points = self._table, self.points(poses)
         if self.merge is None:
             return points, table.friction, table.link
         merged, friction, links = [], [], np.unique(table.link)
@@ -331,7 +346,7 @@ class HandObject:
         stacked = [jnp.stack(parts, 1) for parts in zip(*merged, strict=True)]
         return Points(*stacked), np.array(friction), links
 
-    def _transmission(
+    def transmission(
         self,
         qpos: jax.Array,
         poses: Poses,
@@ -349,14 +364,14 @@ class HandObject:
         joints = qpos[:, model.jnt_qposadr[self.joints]]
         lengths, transmission = self._lengths(qpos, joints)
         springs = jnp.diag(jnp.asarray(model.jnt_stiffness[self.joints], dtype))
-        if len(self._couplings.follower):
-            free = self._couplings.velocities(joints)
+        if len(self.couplings.follower):
+            free = self.couplings.velocities(joints)
             jacobian = jacobian @ free[:, None]
             transmission = jnp.swapaxes(free, -1, -2) @ transmission
             springs = jnp.swapaxes(free, -1, -2) @ springs @ free
             if self.constant_transmission:
                 transmission = np.asarray(
-                    self._couplings.velocities(jnp.zeros(len(self.dofs))).T @ self._actuators.transmission
+                    self.couplings.velocities(jnp.zeros(len(self.dofs))).T @ self._actuators.transmission
                 )
         least, most = self._actuators.limits(lengths)
         actuation = Actuation.from_jacobian(jacobian, transmission, least, most)

@@ -85,7 +85,7 @@ def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> P
     used = np.unique([pair for pairs in found.values() for pair in pairs])
     for (kinds, meshes), pairs in found.items():
         geoms = np.array(pairs)
-        hulls = tuple(None if m < 0 else _hull(model, m) for m in meshes)
+        hulls = tuple(None if m < 0 else hull_of(model, m) for m in meshes)
         groups.append(Group(kinds, *np.searchsorted(used, geoms).T, hulls))
         count = slots(*kinds)
         link.append(np.tile(model.geom_bodyid[geoms[:, 0]], count))
@@ -169,7 +169,7 @@ def _name(model: mujoco.MjModel, geom: int) -> str:
     return repr(model.geom(geom).name) if model.geom(geom).name else f"number {geom}"
 
 
-def _hull(model: mujoco.MjModel, mesh: int) -> Hull:
+def hull_of(model: mujoco.MjModel, mesh: int) -> Hull:
     """The convex hull that MuJoCo keeps of a mesh."""
     start = model.mesh_graphadr[mesh]
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]

@@ -1,0 +1,166 @@
+"""`jaxgrasp synthesize --scene`: a hand and an object in, a file of configurations, a figure and pictures out."""
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxgrasp.cli.problems import CommandError, check_options, write_files
+from jaxgrasp.cli.scene import HandScene
+
+if TYPE_CHECKING:
+    from jaxgrasp.disturbance import DisturbanceSet
+    from jaxgrasp.hands import HandObject
+    from jaxgrasp.synthesis import HandSynthesis
+
+_PICTURES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSynthesis(HandScene):
+    """Options of a synthesis with a hand."""
+
+    links: tuple[str, ...] = ()
+    """Bodies of the hand that shall touch the object; none for the outermost one of every finger."""
+
+    min_contacts: int = 3
+    """With fewer contacts a grasp is not good."""
+
+    torque_limits: bool = False
+    """Let the limits of the actuators count on the way, too, at many times the cost; at the end they always do."""
+
+    keep: int | None = None
+    """How many of the good grasps to write, the best that differ; None for all of them."""
+
+    diversity: float = 0.01
+    """With --keep: grasps whose palms and links are closer than this to those of a better one are left out, m."""
+
+    def check(self) -> None:
+        """Finds what cannot be used before any long work.
+
+        Raises:
+            CommandError: An option cannot be used.
+        """
+        super().check()
+        check_options(
+            ("--min-contacts", self.min_contacts, self.min_contacts >= 1, "at least 1"),
+            ("--keep", self.keep, self.keep is None or self.keep >= 1, "at least 1"),
+            ("--diversity", self.diversity, 0.0 <= self.diversity < math.inf, "metres >= 0"),
+        )
+
+    def run(
+        self,
+        disturbances: "DisturbanceSet",
+        unit: str,
+        *,
+        friction: float | None,
+        max_force: float,
+        starts: int,
+        steps: int,
+        seed: int,
+        output: Path,
+        figure: Path | None,
+    ) -> int:
+        """Synthesises, writes and prints.
+
+        Args:
+            disturbances: What grasps shall withstand.
+            unit: Of the margin then.
+            friction: Of every contact; None is the scene's.
+            max_force: Of every contact, N.
+            starts: How many.
+            steps: Of each.
+            seed: Of the random numbers.
+            output: The file of candidates.
+            figure: The figure; None for none.
+
+        Returns:
+            The exit code: 0, 130 after Ctrl-C, 2 where a file could not be written in the end.
+
+        Raises:
+            CommandError: The scene cannot be used.
+        """
+        import jax
+
+        from jaxgrasp.cli.report import hand_bar, print_hand_synthesis
+        from jaxgrasp.synthesis import synthesize_hand_grasps
+
+        hand = self.hand(friction, max_force)
+        try:
+            with hand_bar(starts, steps) as progress:
+                found = synthesize_hand_grasps(
+                    hand,
+                    jax.random.key(seed),
+                    disturbances=disturbances,
+                    links=self.links or None,
+                    torque_limits=self.torque_limits,
+                    starts=starts,
+                    steps=steps,
+                    min_contacts=self.min_contacts,
+                    progress=progress,
+                )
+        except ValueError as error:
+            raise CommandError(f"--scene {self.scene}: {error}") from error
+        if not len(found.qpos):
+            print("jaxgrasp: interrupted before the first step, nothing was written", file=sys.stderr)
+            return 130
+        kept = np.flatnonzero(found.good) if self.keep is None else found.diverse(self.keep, self.diversity)
+        written, failed = self._write(hand, found, found.take(kept), unit, output, figure)
+        print_hand_synthesis(found, len(kept), self._name, unit, written)
+        if found.interrupted:
+            print("jaxgrasp: interrupted: grasps are those of fewer steps or starts", file=sys.stderr)
+        return 130 if found.interrupted else 2 if failed else 0
+
+    @property
+    def _name(self) -> str:
+        return f"{self.scene} and {self.object_shape}" if self.built_in else f"{self.scene}"
+
+    def _write(
+        self,
+        hand: "HandObject",
+        found: "HandSynthesis",
+        kept: "HandSynthesis",
+        unit: str,
+        output: Path,
+        figure: Path | None,
+    ) -> tuple[list[Path], bool]:
+        from jaxgrasp.viewer import figure_of_hand_synthesis, write_figure
+
+        def write_candidates(path: Path) -> None:
+            np.savez(
+                path,
+                qpos=kept.qpos,
+                pregrasp_qpos=kept.pregrasp,
+                squeeze_qpos=kept.squeeze,
+                squeeze_controls=kept.controls,
+                synthesis_margin=kept.margin,
+                self_penetration=kept.self_penetration,
+            )
+
+        def write_picture(path: Path) -> None:
+            write_figure(figure_of_hand_synthesis(found, name=self._name, unit=unit), path)
+
+        jobs: list[tuple[Path | None, Callable[[Path], None]]] = [(figure, write_picture)]
+        if len(kept.qpos):
+            jobs.insert(0, (output, write_candidates))
+        else:
+            print(f"jaxgrasp: {output}: not written, no grasp is good", file=sys.stderr)
+        written, failed = write_files(*jobs)
+        if len(kept.qpos):
+            # Many machines have nothing to render with: that is told, and no failure.
+            written += write_files((self.picture, lambda path: self._draw(hand, kept, unit, path)))[0]
+        return written, failed
+
+    def _draw(self, hand: "HandObject", kept: "HandSynthesis", unit: str, path: Path) -> None:
+        from jaxgrasp.viewer.scene import draw_scenes
+
+        best = kept.take(kept.diverse(_PICTURES, self.diversity))
+        titles = [f"#{n + 1}: margin {margin:.3g} {unit}" for n, margin in enumerate(best.margin)]
+        try:
+            draw_scenes(path, hand.model, best.qpos, best.contact_points, best.forces, titles)
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
