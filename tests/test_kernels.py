@@ -19,7 +19,8 @@ from jax import lax
 
 import jaxgrasp as jg
 from jaxgrasp import kernels
-from jaxgrasp.kernels import machine, native
+from jaxgrasp.geometry.pairs.geom import Touch
+from jaxgrasp.kernels import machine, native, outline
 
 SAME_MARGIN = {"float64": 2e-8, "float32": 1e-4}
 """Of max(|margin|, Lambda). In float32 both may be off by what the method accepts."""
@@ -356,3 +357,21 @@ def test_a_warning_is_not_repeated():
         native._tell("a reason")
         native._tell("a reason")
     assert len(told) == 1
+
+
+def test_outlines_are_data():
+    """What is kept beside a kernel names records of this package, and nothing that does something."""
+    point = Touch(position=np.zeros((3, 1)), normal=np.zeros((3, 1)), distance=np.zeros(1))
+    tree = {"a": [np.zeros((3, 1), np.float32), None], "b": (np.zeros(2, bool),), "c": point}
+    again = outline.read(outline.written(tree))
+    assert jax.tree.structure(again) == jax.tree.structure(tree)
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(tree), strict=True):
+        assert one.shape == other.shape and one.dtype == other.dtype
+    for content in (
+        b'{"class": ["os", "system"], "fields": {"command": null}}',
+        b'{"class": ["jaxgrasp.kernels.machine", "keep"], "fields": {"key": null, "objects": null}}',
+        b"[]",
+        b"no JSON",
+    ):
+        with pytest.raises(ValueError):
+            outline.read(content)

@@ -10,7 +10,6 @@ import contextvars
 import functools
 import gc
 import os
-import pickle
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import mlir
 
 from jaxgrasp.fence import loops
-from jaxgrasp.kernels import cpu, fingerprint, machine
+from jaxgrasp.kernels import cpu, fingerprint, machine, outline
 from jaxgrasp.kernels.expressions import Unsupported
 from jaxgrasp.kernels.lowering import lowered
 from jaxgrasp.kernels.machine import Unavailable
@@ -115,11 +114,13 @@ def _planned(
         return Plan(*look(), trace, shared)
     origin = fingerprint.of_origin(known_as, given, shared)
     if origin not in _origins:
-        # Whoever can write this could write the kernels, too.
         kept = machine.cached(origin)
-        _origins[origin] = pickle.loads(kept) if kept is not None else look()
         if kept is None:
-            _keep(origin, pickle.dumps(_origins[origin]))
+            _origins[origin] = look()
+            _keep(origin, b"\n".join((_origins[origin][0].encode(), outline.written(_origins[origin][1]))))
+        else:
+            key, _, out = kept.partition(b"\n")
+            _origins[origin] = key.decode(), outline.read(out)
     return Plan(*_origins[origin], trace, shared)
 
 
