@@ -8,7 +8,7 @@ They differ in what is admissible (Coulomb's cone or the inscribed pyramid; |f| 
 delta f_j is free or the blocking force (15).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
@@ -22,12 +22,21 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices
-from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Formulation, Scaled, basics, scaled_formulation
+from jaxgrasp.robustness.chain import (
+    FORMULATIONS,
+    Basics,
+    Formulation,
+    Scaled,
+    basics,
+    contact_rows,
+    scaled_formulation,
+)
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along
 from jaxgrasp.solvers import embedding
-from jaxgrasp.solvers.conic_margin import ConicMargin
+from jaxgrasp.solvers.conic_margin import ConeRows, ConicMargin
 from jaxgrasp.solvers.embedding import ConicOutcome
+from jaxgrasp.solvers.lanes import Each
 from jaxgrasp.solvers.status import Status
 
 _TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
@@ -168,7 +177,12 @@ class Chain:
     @property
     def stages(self) -> tuple:
         """See `Kernel`."""
-        return (lambda grasps, _: (grasps, *self._scaled(grasps)), lambda given: self._solve(*given))
+        solved = [name for name in self.names if self._twin(name) == name]
+        return (
+            lambda grasps, _: self._programs(grasps),
+            Each(dict.fromkeys(solved, solved_program)),
+            lambda given: self._answers(*given),
+        )
 
     def tangents(self, along: Along, out: dict) -> dict:
         """See `Kernel`."""
@@ -198,12 +212,19 @@ class Chain:
         form = FORMULATIONS[name]
         return next(o for o in self.names if FORMULATIONS[o][:2] == form[:2] and (form.free or o == name))
 
-    def _solve(self, grasps: Grasps, shared: Basics, scaled: dict[str, Scaled]) -> dict:
-        solved = {name: outcome(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
+    def _programs(self, grasps: Grasps) -> tuple:
+        shared, scaled = self._scaled(grasps)
+        wanted = {name: programs(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
+        scales = {name: own.scale for name, own in scaled.items()}
+        return (replace(grasps, terms=(), extents=()), shared, scales), wanted
+
+    def _answers(self, kept: tuple, solved: dict[str, ConicOutcome]) -> dict:
+        grasps, shared, scales = kept
         answers = {}
         for name in self.names:
-            twin = self._twin(name)
-            solution = formulation_answer(grasps, shared, scaled[twin], FORMULATIONS[name], solved[twin])
+            twin, form = self._twin(name), FORMULATIONS[name]
+            rows = contact_rows(form.exact, self.cone_edges, self.norm_bound and form.exact, grasps.friction)
+            solution = formulation_answer(grasps, shared, scales[twin], rows, form, solved[twin])
             answers[name] = solution, solved[twin].point
         return answers
 
@@ -243,20 +264,26 @@ def _program_weights(solution: FormulationSolution, cotangents: tuple, scaled: S
     return given * scale
 
 
-def outcome(grasps: Grasps, shared: Basics, scaled: Scaled, free: bool) -> ConicOutcome:
-    """Solve all programs of a formulation but those whose answer is known; point leaves (..., D, *lanes)."""
+def programs(grasps: Grasps, shared: Basics, scaled: Scaled, free: bool) -> tuple[ConicMargin, jax.Array]:
+    """The programs of a formulation, and which of them to solve: all but those whose answer is known."""
     runs = jnp.broadcast_to(grasps.valid & ~shared.load_outside, scaled.scale.shape)
     if free:
         there = shared.disturbed & ~shared.outside
         runs &= jnp.concatenate([there, jnp.ones_like(there[:1])])
-    return embedding.solve(scaled.problem, _TOLERANCE[scaled.scale.dtype.name], runs)
+    return scaled.problem, runs
+
+
+def solved_program(given: tuple[ConicMargin, jax.Array]) -> ConicOutcome:
+    """The outcome of a program for every lane that asks for it."""
+    problem, runs = given
+    return embedding.solve(problem, _TOLERANCE[problem.rhs.dtype.name], runs)
 
 
 def formulation_answer(
-    grasps: Grasps, shared: Basics, scaled: Scaled, form: Formulation, out: ConicOutcome
+    grasps: Grasps, shared: Basics, scale: jax.Array, rows: list[ConeRows], form: Formulation, out: ConicOutcome
 ) -> FormulationSolution:
-    """What the outcome of its programs says about a formulation."""
-    accepted, scale = _ACCEPTED[scaled.scale.dtype.name], scaled.scale
+    """What the outcome of its programs, with these rows of a contact, says about a formulation."""
+    accepted = _ACCEPTED[scale.dtype.name]
     value, bound = jnp.minimum(out.point.margin, out.upper), out.upper
     solved = (out.error <= accepted) & ~out.infeasible
     # What is zero to the tolerance is zero.
@@ -285,7 +312,7 @@ def formulation_answer(
     program = worst if scale.shape[0] > 1 else jnp.zeros_like(worst)
     forces, disturbed = _forces(shared, form, out.point.x, directions, margin, program)
     finite = answered & ~undisturbed & ~shared.outside.any(0)
-    direction, contact, row = _binding(scaled.problem, form, out.point.z, program)
+    direction, contact, row = _binding(shared, rows, form, out.point.z, program)
     told = lambda v: jnp.where(finite, v, -1).astype(jnp.int32)  # noqa: E731
     return FormulationSolution(
         margin=hide(margin),
@@ -338,17 +365,26 @@ def _pick(values: jax.Array, program: jax.Array) -> jax.Array:
 
 
 def _binding(
-    problem: ConicMargin, form: Formulation, z: tuple[jax.Array, ...], program: jax.Array
+    shared: Basics, rows: list[ConeRows], form: Formulation, z: tuple[jax.Array, ...], program: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Direction, contact and row of the largest multiplier of the program that binds; direction -1 for rest."""
     # (d, J, n, *lanes) each; of a second-order cone the head is the size of the whole.
     own = [_pick(jnp.moveaxis(z_p, 3, 0), program) for z_p in z]
-    own = [z_p[:1] if part.second_order else z_p for part, z_p in zip(problem.rows, own, strict=True)]
-    rows = jnp.concatenate(own)
-    _, copies, n, lanes = rows.shape
-    where = jnp.argmax(rows.reshape(-1, lanes), 0)
+    own = [z_p[:1] if part.second_order else z_p for part, z_p in zip(rows, own, strict=True)]
+    flat = jnp.concatenate(own)
+    _, copies, n, lanes = flat.shape
+    where = jnp.argmax(flat.reshape(-1, lanes), 0)
     row, copy, contact = where // (copies * n), where // n % copies, where % n
     if form.free:
         return program, contact, row
-    # The last copy is rest.
-    return jnp.where(copy == copies - 1, -1, copy if form.shared else program), contact, row
+    if copies > 1:
+        # The last copy is rest.
+        return jnp.where(copy == copies - 1, -1, copy), contact, row
+    # What of the blocking forces loads the row most.
+    (pyramid,) = rows
+    moved = shared.answers / shared.sizes
+    moved = jnp.take_along_axis(moved, contact[None, None, None], 2)[:, :, 0]
+    loads = pyramid.apply(jnp.moveaxis(moved, 0, 1)[:, :, None])[:, 0, :, 0]
+    loads = jnp.take_along_axis(loads, row[None, None], 0)[0]
+    worst = jnp.argmax(loads, 0) if form.shared else program
+    return jnp.where(_pick(loads, worst) > 0, worst, -1), contact, row

@@ -1,6 +1,6 @@
 """The least-effort program (11) over the tightening forces and all answers to the disturbances."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -12,15 +12,25 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Scaled, basics, scaled_formulation
-from jaxgrasp.robustness.formulations import FormulationSolution, check_vertices, formulation_answer, outcome, tile_of
+from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, contact_rows, scaled_formulation
+from jaxgrasp.robustness.formulations import (
+    FormulationSolution,
+    check_vertices,
+    formulation_answer,
+    programs,
+    solved_program,
+    tile_of,
+)
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.arrow_problem import ArrowProblem, ArrowRecord, patterns_of
+from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.interior_point import Settings
+from jaxgrasp.solvers.lanes import Each
 from jaxgrasp.solvers.status import Status
 
+_FREE = FORMULATIONS["13"]
 _SETTINGS = {
     "float64": Settings(
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
@@ -110,7 +120,8 @@ class _TotalEffort(OfPyramids):
     @property
     def stages(self) -> tuple:
         return (
-            lambda grasps, _: (grasps, *self._free(grasps)),
+            lambda grasps, _: self._free(grasps),
+            Each({"13": solved_program}),
             lambda given: self._start(*given),
             lambda given: self._solve(*given),
         )
@@ -121,13 +132,17 @@ class _TotalEffort(OfPyramids):
         moved = {"effort": change, "lower_bound": change}
         return TotalEffortSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), ArrowRecord(*[None] * 5)
 
-    def _free(self, grasps: Grasps) -> tuple[Basics, Scaled]:
+    def _free(self, grasps: Grasps) -> tuple:
         shared = basics(grasps, False)
-        return shared, scaled_formulation(grasps, shared, FORMULATIONS["13"], self.cone_edges, False)
+        scaled = scaled_formulation(grasps, shared, _FREE, self.cone_edges, False)
+        kept = replace(grasps, terms=(), extents=()), shared, scaled.scale
+        return kept, {"13": programs(grasps, shared, scaled, True)}
 
-    def _start(self, grasps: Grasps, shared: Basics, free: Scaled) -> tuple:
-        found = outcome(grasps, shared, free, True)
-        answer = formulation_answer(grasps, shared, free, FORMULATIONS["13"], found)
+    def _start(self, kept: tuple, solved: dict[str, ConicOutcome]) -> tuple:
+        grasps, shared, scale = kept
+        found = solved["13"]
+        rows = contact_rows(False, self.cone_edges, False, grasps.friction)
+        answer = formulation_answer(grasps, shared, scale, rows, _FREE, found)
         # Each direction on its way from f_0 to the most that it allows: inside the rows.
         some = jnp.isfinite(answer.directions) & (answer.directions > 0)
         share = jnp.where(some, grasps.margin / jnp.where(some, answer.directions, 1), 0)
