@@ -280,6 +280,7 @@ def sample(seed: int, count: int, n_c: int, n_d: int) -> Batch:
 
     A third without load, a third with a light and a third with a heavy one; one in eight has its contacts on one side,
     one in eight a contact twice, one in eight all in one line (rank 5); one in five has the six forces as disturbances.
+    Half of the grasps whose G is short of rank have their wrenches in its range.
     """
     rng = np.random.default_rng(seed)
     axes = rng.uniform(0.4, 1.0, (count, 1, 3))
@@ -303,14 +304,32 @@ def sample(seed: int, count: int, n_c: int, n_d: int) -> Batch:
     plain = np.arange(count) % 5 == 0
     wrenches[plain] = 0
     wrenches[plain, :6] = np.vstack([np.eye(6)[:3], -np.eye(6)[:3]])
+    positions, frames = 0.05 * u * axes, np.stack([t1, np.cross(normals, t1), normals], -1)
+    into = projections(positions, frames)
+    into[np.arange(count) // 8 % 2 > 0] = np.eye(6)
+    load, wrenches = np.einsum("nab,nb->na", into, load), np.einsum("nab,njb->nja", into, wrenches)
     return Batch(
-        0.05 * u * axes,
-        np.stack([t1, np.cross(normals, t1), normals], -1),
+        positions,
+        frames,
         np.exp(rng.uniform(np.log(0.2), np.log(1.2), (count, n_c))),
         max_force,
         wrenches,
         load,
     )
+
+
+def projections(positions: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Of wrenches onto the range of G, orthogonal for moments over 5 cm; exactly I where that is everything."""
+    moments = np.cross(positions[:, :, :, None], frames, axis=2) / 0.05
+    G = np.concatenate([frames, moments], 2).transpose(0, 2, 1, 3).reshape(len(positions), 6, -1)
+    units = np.diag(np.repeat([1.0, 0.05], 3))
+    out = np.tile(np.eye(6), (len(G), 1, 1))
+    for i, one in enumerate(G):
+        U, s, _ = np.linalg.svd(one)
+        keep = s > RANK_TOLERANCE * s[0]
+        if not keep.all():
+            out[i] = units @ U[:, keep] @ U[:, keep].T @ np.linalg.inv(units)
+    return out
 
 
 def recorded() -> Batch | None:
