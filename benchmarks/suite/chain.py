@@ -77,6 +77,15 @@ class Case:
         return bool(np.any(np.abs(missed).max(-1) > 1e-8 * np.abs(self.W).max(-1).clip(1e-300)))
 
     @cached_property
+    def independent(self) -> np.ndarray:
+        """(r, 6): orthonormal combinations of the equalities that say all that they say.
+
+        Clarabel stalls on equalities that follow from each other.
+        """
+        U, s, _ = np.linalg.svd(np.column_stack([self.G, self.W.T, self.b]), full_matrices=False)
+        return U[:, s > RANK_TOLERANCE * s[0]].T
+
+    @cached_property
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """(n_c (n_e + 1), 3 n_c) and right-hand sides: pyramids, then the bound on the normal force."""
         angles = np.pi * (2 * np.arange(self.edges) + 1) / self.edges
@@ -207,7 +216,10 @@ def exact(case: Case, norm_bound: bool = False) -> float:
     Where it fails on the whole program it is asked for f_0 and one direction at a time.
     """
     whole = _exact(case, case.W, norm_bound)
-    return whole if not np.isinf(whole) else np.min([_exact(case, w[None], norm_bound) for w in case.W])
+    if not np.isinf(whole):
+        return whole
+    each = [_exact(case, w[None], norm_bound) for w in case.W]
+    return np.inf if np.isinf(each).any() else np.min(each)
 
 
 def _exact(case: Case, W: np.ndarray, norm_bound: bool) -> float:
@@ -215,11 +227,12 @@ def _exact(case: Case, W: np.ndarray, norm_bound: bool) -> float:
     cones = case.cones(norm_bound)
     own = np.vstack([A for _, A, _ in cones])
     rows = sp.hstack([sp.block_diag([own] * count), sp.csr_matrix((count * len(own), 1))])
-    wrenches = np.vstack([W, np.zeros(6)]).reshape(-1, 1)
-    equal = sp.hstack([sp.block_diag([case.G] * count), sp.csr_matrix(wrenches)])
+    U = case.independent
+    wrenches = (np.vstack([W, np.zeros(6)]) @ U.T).reshape(-1, 1)
+    equal = sp.hstack([sp.block_diag([U @ case.G] * count), sp.csr_matrix(wrenches)])
     cost = np.zeros(count * size + 1)
     cost[-1] = -1
-    value = _by_clarabel(cost, rows, cones * count, equal, np.tile(case.b, count))
+    value = _by_clarabel(cost, rows, cones * count, equal, np.tile(U @ case.b, count))
     return value * case.scale if not value < -1e-7 else np.nan
 
 
@@ -232,8 +245,9 @@ def exact_fixed(case: Case, norm_bound: bool = False) -> float:
     rows = np.vstack([np.hstack([own, (own @ a)[:, None]]) for a in case.answers])
     cost = np.zeros(case.G.shape[1] + 1)
     cost[-1] = -1
-    equal = np.hstack([case.G, np.zeros((6, 1))])
-    value = _by_clarabel(cost, rows, cones * len(case.answers), equal, case.b)
+    U = case.independent
+    equal = np.hstack([U @ case.G, np.zeros((len(U), 1))])
+    value = _by_clarabel(cost, rows, cones * len(case.answers), equal, U @ case.b)
     return value * case.scale if not value < -1e-7 else np.nan
 
 
@@ -368,8 +382,9 @@ def least_total_effort(case: Case, margin: float) -> float:
             sp.hstack([sp.vstack([sp.csr_matrix(A)] * count), sp.block_diag([A] * count)]),
         ]
     )
-    equal = sp.block_diag([case.G] * (count + 1)).tocsr()
-    sides = np.concatenate([case.b, *(-margin / case.scale * case.W)])
+    U = case.independent
+    equal = sp.block_diag([U @ case.G] * (count + 1)).tocsr()
+    sides = np.concatenate([U @ case.b, *(-margin / case.scale * case.W @ U.T)])
     scale = weights.max()
     status, _, value = _clarabel(
         sp.diags(np.tile(weights / scale, count + 1)),

@@ -2,7 +2,8 @@
 
 Two shapes. Where the answer delta f_j to a disturbance is free, f_0 + delta f_j is a force of its own: the directions
 fall apart, one program each, max lambda with G f = b - lambda W_j, and f_0 another. Where delta f_j is the blocking
-force (15), one f_0 is shared: the rows come in copies, one for each direction and one for rest.
+force (15), one f_0 is shared. Coulomb's cones then come in copies, one for each direction and one for rest; of linear
+rows that differ only in what lambda takes from them, the strictest is enough, since lambda >= 0 is asked for.
 
 Per contact forces are scaled as in `program`: tangential by mu F, normal by F.
 """
@@ -138,7 +139,7 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
         given = jnp.moveaxis(basics.answers / basics.sizes, 0, 2)
         sigmas = [jnp.where(present[:, None] > 0, part.apply(given), 0) for part in parts]
         if not form.exact:
-            # Numbers, so for lambda >= 0 the largest of all directions and of rest, 0, is as strict as all of them.
+            # The strictest of all directions and of rest, for which it is 0.
             sigmas = [jnp.maximum(sigma, 0) for sigma in sigmas]
             sigmas = [jnp.max(sigma, 3, keepdims=True) if form.shared else sigma for sigma in sigmas]
         largest = fold(jnp.maximum, [jnp.max(jnp.abs(sigma), (0, 1, 2)) for sigma in sigmas])

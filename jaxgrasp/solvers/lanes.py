@@ -96,7 +96,7 @@ def _of_programs(function: Callable[[Tree], Tree], programs: Tree, tile: int) ->
     lanes, count = leaves[0].shape[0], max(x.shape[-1] for x in leaves)
     spread = [jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], count)), -1, 1) for x in leaves]
     flat = [x.reshape(lanes * count, *x.shape[2:]) for x in spread]
-    out = _run((function,), structure, (False,) * len(leaves), 0, tile)(flat)
+    out = _run((function,), structure, (False,) * len(leaves), 0, tile * count)(flat)
     return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(lanes, count, *x.shape[1:]), 1, -1), out)
 
 
