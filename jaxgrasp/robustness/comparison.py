@@ -11,8 +11,9 @@ from jaxgrasp.arrays import literal
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.answers import FormulationSolution
 from jaxgrasp.robustness.chain import FORMULATIONS
-from jaxgrasp.robustness.formulations import Chain, FormulationSolution, check_vertices, formulation_margin, tile_of
+from jaxgrasp.robustness.formulations import Chain, check_vertices, formulation_margin, tile_of
 from jaxgrasp.robustness.grasps import over_grasps
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening import largest_disturbance

@@ -12,15 +12,9 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, contact_rows, scaled_formulation
-from jaxgrasp.robustness.formulations import (
-    FormulationSolution,
-    check_vertices,
-    formulation_answer,
-    programs,
-    solved_program,
-    tile_of,
-)
+from jaxgrasp.robustness.answers import Verdict, programs, solved_program, verdict
+from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formulation
+from jaxgrasp.robustness.formulations import check_vertices, tile_of
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.solvers import interior_point
@@ -141,21 +135,21 @@ class _TotalEffort(OfPyramids):
     def _start(self, kept: tuple, solved: dict[str, ConicOutcome]) -> tuple:
         grasps, shared, scale = kept
         found = solved["13"]
-        rows = contact_rows(False, self.cone_edges, False, grasps.friction)
-        answer = formulation_answer(grasps, shared, scale, rows, _FREE, found)
+        answer = verdict(grasps, shared, scale, _FREE, found)
         # Each direction on its way from f_0 to the most that it allows: inside the rows.
-        some = jnp.isfinite(answer.directions) & (answer.directions > 0)
+        some = answer.answered & jnp.isfinite(answer.directions) & (answer.directions > 0)
         share = jnp.where(some, grasps.margin / jnp.where(some, answer.directions, 1), 0)
         x, rest = found.point.x, found.point.x[:, :, -1:]
         guess = jnp.concatenate([rest + jnp.clip(share, 0, 1) * (x[:, :, :-1] - rest), rest], 2)
         return grasps, shared, answer, guess
 
-    def _solve(self, grasps: Grasps, shared: Basics, answer: FormulationSolution, guess: jax.Array) -> tuple:
+    def _solve(self, grasps: Grasps, shared: Basics, answer: Verdict, guess: jax.Array) -> tuple:
         problem, unit = _problem(grasps, shared, self.cone_edges, guess)
         dtype = unit.dtype.name
         settings = _SETTINGS[dtype]
-        bearable = (answer.status == Status.SOLVED) | (answer.status == Status.UNBOUNDED)
-        active = bearable & (grasps.margin <= answer.upper_bound * (1 + settings.tolerance))
+        bearable = answer.answered
+        most = jnp.maximum(jnp.min(answer.upper, 0), jnp.min(answer.directions, 0))
+        active = bearable & (grasps.margin <= most * (1 + settings.tolerance))
         # Without a load and disturbances no forces at all are the answer, exactly.
         idle = active & (problem.rhs == 0).all((0, 1))
         out = interior_point.solve(problem, settings, active & ~idle)
