@@ -6,7 +6,7 @@ every contact at rest and under every disturbance, tied by lambda; (16) the rows
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
@@ -274,6 +274,9 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def __getitem__(self, rows) -> Batch:
+        return Batch(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def case(self, i: int, edges: int = 8) -> Case:
         """One of them."""

@@ -34,6 +34,8 @@ _SETTINGS = {
     ),
 }
 _ACCEPTED = {"float64": 1e-7, "float32": 1e-3}
+# Wrenches up to this, in units of the mean of f_max.
+_NOTHING = {"float64": 1e-8, "float32": 1e-5}
 
 
 @jax.tree_util.register_dataclass
@@ -150,8 +152,9 @@ class _TotalEffort(OfPyramids):
         bearable = answer.answered
         most = jnp.maximum(jnp.min(answer.upper, 0), jnp.min(answer.directions, 0))
         active = bearable & (grasps.margin <= most * (1 + settings.tolerance))
-        # Without a load and disturbances no forces at all are the answer, exactly.
-        idle = active & (problem.rhs == 0).all((0, 1))
+        # Without a load and disturbances no forces at all are the answer. What rounding leaves of nothing counts as
+        # nothing: a grasp that withstands none has no room inside its rows.
+        idle = active & (jnp.abs(problem.rhs) <= _NOTHING[dtype]).all((0, 1))
         out = interior_point.solve(problem, settings, active & ~idle)
         record = jax.tree.map(lambda v: jnp.where(idle, 0, v), out.record)
         gap = (record.upper - record.lower) / problem.gap_scale(record)
