@@ -291,7 +291,7 @@ def test_gradients_are_central_differences(name: str) -> None:
 
 @pytest.mark.thorough
 def test_gradient_of_the_total_effort() -> None:
-    batch = chain.sample(41, 32, 3, 6)
+    batch = chain.sample(41, 64, 3, 6)
     most = np.asarray(margins_of(batch, "13").margin)
     some = jnp.asarray(np.isfinite(most) & (most > 1e-2) & of_full_rank(batch))
     wanted = jnp.where(some, 0.7 * most, 0)
@@ -305,7 +305,8 @@ def test_gradient_of_the_total_effort() -> None:
 
     gradients = jax.grad(lambda *data: least(*data).sum(), argnums=(0, 1, 2, 3))(*data)
     rng = np.random.default_rng(0)
-    for k, step in enumerate((1e-6, 1e-4, 1e-4, 1e-4)):
+    step = 1e-6
+    for k in range(len(data)):
         along = jnp.asarray(rng.normal(size=data[k].shape))
         ends = [least(*data[:k], data[k] + sign * step * along, *data[k + 1 :]) for sign in (1, -1)]
         central = np.asarray(ends[0] - ends[1]) / (2 * step)
