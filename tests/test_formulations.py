@@ -133,6 +133,21 @@ def test_forces_hold_and_answer() -> None:
         assert slip[held].max() <= 1e-6 and size[held].max() <= 1e-6
 
 
+@pytest.mark.parametrize("name", ["13", "16"])
+def test_what_binds_has_no_slack(name: str) -> None:
+    batch = small()
+    found = jax.tree.map(np.asarray, margins_of(batch, name))
+    some = np.flatnonzero(np.isfinite(found.margin) & (found.margin > 1e-3))
+    direction, contact, row = found.direction[some], found.contact[some], found.row[some]
+    assert len(some) > 10 and len(set(direction)) > 3 and (direction >= 0).all()
+    force = found.disturbed_forces[some, direction, contact]
+    mu, bound = batch.friction[some, contact], batch.max_force[some, contact]
+    angle = np.pi * (2 * row + 1) / 8
+    slip = np.cos(angle) * force[:, 0] + np.sin(angle) * force[:, 1] + mu * np.cos(np.pi / 8) * force[:, 2]
+    assert len(set(row)) > 3
+    assert np.abs(np.where(row < 8, slip, -force[:, 2] - bound)).max() <= 1e-6
+
+
 @pytest.mark.thorough
 def test_the_chain() -> None:
     """21 = 16 <= 13 <= 12, and per direction as trap 3 has it, with equal bounds."""
