@@ -1,7 +1,7 @@
 """What each approximation of the paper's chain costs, and how fast its programs are.
 
 `python -m benchmarks.formulations` writes formulations.md and formulations.png beside this file. formulations.json
-keeps what was measured; `--parts margins,edges,speed` measures some of it anew. The recorded grasps are taken
+keeps what was measured; `--parts margins,edges,speed,compiling` measures some of it anew. The recorded grasps are taken
 where they are present.
 """
 
@@ -11,8 +11,9 @@ import argparse
 import json
 import os
 import platform
+import tempfile
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -23,16 +24,22 @@ jax.config.update("jax_enable_x64", True)
 import jaxgrasp as jg  # noqa: E402
 from benchmarks.suite import chain, chain_peers  # noqa: E402
 from benchmarks.suite.clock import by_turns, say, warn_if_busy  # noqa: E402
+from benchmarks.suite.fresh import spent  # noqa: E402
+from benchmarks.suite.workers import Workers  # noqa: E402
 from jaxgrasp.robustness.comparison import STEPS  # noqa: E402
 
 HERE = Path(__file__).parent
 KEPT = HERE / "formulations.json"
 # n_c, n_d, grasps; the recorded ones come on top.
-SHAPES = ((4, 6, 1180), (2, 6, 250), (8, 64, 100))
+SHAPES = (
+    *((2, 6, 200), (2, 24, 150), (3, 6, 250), (3, 24, 150), (4, 6, 590), (4, 24, 150)),
+    *((5, 6, 200), (5, 24, 200), (5, 64, 100), (8, 6, 200), (8, 24, 150), (8, 64, 150)),
+)
+# Of these the table has what each step costs.
+COSTS = ("recorded, 4 contacts, 6 directions", "random, 4 contacts, 6 directions", "random, 8 contacts, 64 directions")
 EDGES = (4, 8, 16, 32, 64)
 PART = 590
 TIMED, ROUNDS = 512, 3
-LINEAR = ("13", "16", "per_direction", "per_direction_prestrained")
 
 
 def contacts_of(batch: chain.Batch) -> jg.Contacts:
@@ -43,7 +50,7 @@ def compared(batch: chain.Batch) -> jg.Comparison:
     """In parts of one size, which are compiled once."""
     parts = []
     for start in range(0, len(batch), PART):
-        part = chain.Batch(**{f.name: getattr(batch, f.name)[start : start + PART] for f in fields(batch)})
+        part = batch[start : start + PART]
         vertices = jg.DisturbanceSet.vertices(part.wrenches)
         found = jg.compare_formulations(contacts_of(part), vertices, part.load)
         parts.append(jax.tree.map(np.asarray, found))
@@ -65,8 +72,10 @@ def margins() -> dict:
     for family, batch in families().items():
         if family in left:
             continue
+        start = time.perf_counter()
         found = compared(batch)
-        left[family] = cost(found, len(batch))
+        say(f"  {family}: ours in {time.perf_counter() - start:.0f} s")
+        left[family] = cost(found, batch)
         cases = [batch.case(i) for i in range(len(batch))]
         units = np.array([case.scale for case in cases])
         for name, oracle in chain.ORACLES.items():
@@ -74,42 +83,51 @@ def margins() -> dict:
             known, margin = ~np.isinf(truth), found.margins[name]
             error = np.where(known & np.isfinite(truth), np.abs(margin - truth) / np.fmax(truth, units), 0)
             wrong = known & (np.isnan(truth) != np.isnan(margin))
-            record(table, name, family, batch, found.statuses[name], error, known, wrong)
+            record(table, name, family, found.statuses[name], error, known, wrong)
         most = found.margins["13"]
         asked = np.where(np.isfinite(most), most * np.random.default_rng(0).uniform(0.1, 1.1, len(batch)), 1.0)
         vertices = jg.DisturbanceSet.vertices(batch.wrenches)
         effort = jg.least_total_effort(contacts_of(batch), vertices, asked, batch.load)
         truth = np.array([chain.least_total_effort(case, a) for case, a in zip(cases, asked, strict=True)])
-        known = ~np.isnan(truth) & ~(np.abs(asked - most) <= 1e-4 * np.maximum(1, most))
+        # At the edge of what can be had either answer will do; zero is one that both know.
+        edge = (np.abs(asked - most) <= 1e-4 * np.maximum(1, most)) & (asked > 0)
+        known = ~np.isnan(truth) & ~edge
         ours = np.asarray(effort.effort)
         size = np.maximum(truth, 1e-3 * batch.max_force.max(-1) ** 2)
         error = np.where(known & np.isfinite(truth), np.abs(ours - np.where(np.isinf(truth), 0, truth)) / size, 0)
         wrong = known & (np.isinf(truth) != np.isnan(ours))
-        record(table, "11", family, batch, np.asarray(effort.status), error, known, wrong)
-        say(f"  {family}: worst " + ", ".join(f"{n} {t['families'][family]:.1e}" for n, t in table.items()))
+        record(table, "11", family, np.asarray(effort.status), error, known, wrong)
+        worst = ", ".join(f"{n} {t[family]['error']:.1e}" for n, t in table.items())
+        say(f"  {family}: {time.perf_counter() - start:.0f} s, worst {worst}")
         keep({"accuracy": table, "costs": left})
     return {}
 
 
-def record(table: dict, name: str, family: str, batch, status, error, known, wrong) -> None:
-    own = table.setdefault(name, {"grasps": 0, "decided": 0, "judged": 0, "wrong": 0, "answers": 0, "families": {}})
+def record(table: dict, name: str, family: str, status, error, known, wrong) -> None:
     decided = (status == jg.Status.SOLVED) | (status == jg.Status.INFEASIBLE)
-    own["grasps"] += len(batch)
-    own["decided"] += int(decided.sum())
-    own["judged"] += int(known.sum())
-    own["wrong"] += int(wrong.sum())
-    own["answers"] += int((status == jg.Status.SOLVED).sum())
-    own["families"][family] = float(np.nanmax(np.where(wrong, 0, error)))
+    for what, rows in (("undecided", ~decided), ("feasibility otherwise", wrong), ("far", ~wrong & (error > 1e-6))):
+        if rows.any():
+            say(f"    {name}: {what} {np.flatnonzero(rows).tolist()}")
+    table.setdefault(name, {})[family] = {
+        "grasps": len(status),
+        "decided": int(decided.sum()),
+        "judged": int(known.sum()),
+        "wrong": int(wrong.sum()),
+        "answers": int((status == jg.Status.SOLVED).sum()),
+        "error": float(np.nanmax(np.where(wrong, 0, error))),
+    }
 
 
-def cost(found: jg.Comparison, grasps: int) -> dict:
+def cost(found: jg.Comparison, batch: chain.Batch) -> dict:
     """Quartiles of the ratio of neighbours in the chain, over the grasps with a margin."""
+    deficient = (chain.projections(batch.positions, batch.frames) != np.eye(6)).any((1, 2))
     margins = found.margins
     some = margins["21"] > 1e-3 * np.nanmax(margins["21"])
     pairs = STEPS | {"all of it": ("12", "21")}
     ratio = lambda more, less: np.quantile(margins[less][some] / margins[more][some], [0.25, 0.5, 0.75]).tolist()  # noqa: E731
     ratios = {step: ratio(*pair) for step, pair in pairs.items()} if some.any() else {}
-    return {"counted": int(some.sum()), "grasps": grasps, "ratios": ratios}
+    counts = {"counted": int(some.sum()), "grasps": len(batch), "deficient": int(deficient.sum())}
+    return counts | {"margin": int((deficient & (margins["21"] > 0)).sum()), "ratios": ratios}
 
 
 def edges() -> dict:
@@ -134,36 +152,35 @@ def edges() -> dict:
 def speed() -> dict:
     """Grasps a second by every formulation, and of the peers, in one run by turns."""
     load = warn_if_busy()
-    many = chain.sample(5, 4 * TIMED, 4, 6)
+    many = chain.sample(5, 8 * TIMED, 4, 6)
     # Peers' updates want one friction and bound; nothing is lost without load and degenerate contacts.
-    plain = (np.arange(len(many)) % 8 > 2) & (np.arange(len(many)) % 3 == 0)
-    batch = chain.Batch(**{f.name: getattr(many, f.name)[plain] for f in fields(many)})
+    batch = many[(np.arange(len(many)) % 8 > 2) & (np.arange(len(many)) % 3 == 0)]
     batch = replace(batch, friction=np.full_like(batch.friction, 0.6), max_force=np.full_like(batch.max_force, 5.0))
     contacts, vertices = contacts_of(batch), jg.DisturbanceSet.vertices(batch.wrenches)
-    margin = np.asarray(jg.formulation_margin(contacts, vertices, "13").margin)
-    asked = 0.75 * margin
-    jobs, answers = {}, {}
+    asked = 0.75 * np.asarray(jg.formulation_margin(contacts, vertices, "13").margin)
+    ours = {name: lambda name=name: jg.formulation_margin(contacts, vertices, name).margin for name in chain.ORACLES}
+    ours["11"] = lambda: jg.least_total_effort(contacts, vertices, asked).effort
+    ours["21"] = lambda: jg.largest_disturbance(contacts, vertices).margin
+    jobs, answers, peers = {}, {}, {}
 
-    def add(name: str, label: str, solve) -> None:
+    def add(name: str) -> None:
         def job() -> None:
-            answers[name, label] = np.asarray(solve())
+            answers[name] = np.asarray(ours[name]())
 
-        jobs[f"{name}: {label}"] = job
+        jobs[f"{name}: jaxgrasp"] = job
 
-    for name in ("12", "12_fixed", *LINEAR):
-        add(name, "jaxgrasp", lambda name=name: jg.formulation_margin(contacts, vertices, name).margin)
-        solvers = chain_peers.conic(batch, name) if name in ("12", "12_fixed") else chain_peers.linear(batch, name)
-        for label, solve in solvers.items():
-            add(name, label, solve)
-    add("21", "jaxgrasp", lambda: jg.largest_disturbance(contacts, vertices).margin)
-    add("11", "jaxgrasp", lambda: jg.least_total_effort(contacts, vertices, asked).effort)
-    for label, solve in chain_peers.total_effort(batch, asked).items():
-        add("11", label, solve)
-    timings = by_turns(jobs, ROUNDS)
+    with Workers(os.cpu_count() or 1) as workers:
+        for name in ours:
+            add(name)
+            for label in chain_peers.PEERS.get(name, ()):
+                part = lambda rows, name=name, label=label: (batch[rows], name, label, asked[rows])  # noqa: E731
+                peers[name, label] = workers.spread(f"{name} {label}", chain_peers.solver, len(batch), part)
+                jobs[f"{name}: {label}"] = peers[name, label].run
+        timings = by_turns(jobs, ROUNDS)
     table: dict[str, dict] = {}
-    for (name, label), values in answers.items():
-        ours = answers[name, "jaxgrasp"]
-        error = np.abs(values - ours) / np.maximum(1, np.abs(ours))
+    found = {(name, "jaxgrasp"): value for name, value in answers.items()}
+    for (name, label), values in (found | {key: loaded.answers for key, loaded in peers.items()}).items():
+        error = np.abs(values - answers[name]) / np.maximum(1, np.abs(answers[name]))
         table.setdefault(name, {})[label] = {
             "per second": len(batch) / timings[f"{name}: {label}"].seconds,
             "cpu": timings[f"{name}: {label}"].cpu_per_wall,
@@ -171,6 +188,22 @@ def speed() -> dict:
             "apart": float(np.nanmax(error)),
         }
     return {"speed": {"grasps": len(batch), "load": load, "table": table}}
+
+
+def compiling() -> dict:
+    """Seconds to the first answer of a fresh process, less those of imports: nothing compiled before, then kernels."""
+    load, rows = warn_if_busy(), {}
+    imports = spent(["-m", "benchmarks.suite.first", "nothing", "float64", "64"])[0]
+    asked = [(name, f"formulation {name}") for name in chain.ORACLES]
+    before = os.environ.get("XDG_CACHE_HOME")
+    for name, how in [*asked, ("11", "total effort"), ("all but (11), (21) included", "comparison")]:
+        with tempfile.TemporaryDirectory() as folder:
+            os.environ["XDG_CACHE_HOME"] = folder
+            rows[name] = [spent(["-m", "benchmarks.suite.first", how, "float64", "64"])[0] - imports for _ in range(2)]
+        say(f"  {name}: {rows[name][0]:.1f} s, {rows[name][1]:.1f} s with kernels on disk")
+    del os.environ["XDG_CACHE_HOME"]
+    os.environ.update({} if before is None else {"XDG_CACHE_HOME": before})
+    return {"compiling": {"rows": rows, "load": load}}
 
 
 def figure(found: dict) -> None:
@@ -217,23 +250,37 @@ def text(found: dict) -> str:
             "## Against HiGHS and Clarabel",
             "",
             "Whole programs: (12) and (13) with the forces of all directions, (16) with the rows of all. Random grasps",
-            "without and with load, some on one side, with a contact twice or with all contacts in line, and the",
-            "recorded ones. Errors are of max(margin, natural scale), of (11) of max(effort, f_max^2 / 1000). (12) has",
-            "the bound of (8).",
-            "`decided` is solved or proved infeasible; `judged` where the other solver has an answer, too.",
+            "without and with load, some on one side, with a contact twice or with all contacts in line (half of those",
+            "with wrenches in the range of G), and the recorded ones. Errors are of max(margin, natural scale); those",
+            "of (11) are of max(effort, f_max^2 / 1000). (12) has the bound of (8).",
+            "`decided` is solved or proved infeasible; `judged` where the other solver has an answer, too (in (11) the",
+            "margins asked for are random shares of (13)'s, some above it; those within 1e-4 of it are not judged).",
             "",
-            "| formulation | grasps | decided | solved | judged | feasibility otherwise | worst error | worst family |",
-            "|---|---|---|---|---|---|---|---|",
+            "| formulation | grasps | decided | solved | judged | feasibility otherwise | worst error |",
+            "|---|---|---|---|---|---|---|",
         ]
-        for name, r in found["accuracy"].items():
-            family = max(r["families"], key=r["families"].get)
+        names = list(found["accuracy"])
+        for name in names:
+            own = found["accuracy"][name].values()
+            counts = [sum(r[key] for r in own) for key in ("grasps", "decided", "answers", "judged", "wrong")]
             lines.append(
-                f"| {name} | {r['grasps']:,} | {r['decided']:,} | {r['answers']:,} | {r['judged']:,} | {r['wrong']} | "
-                f"{r['families'][family]:.1e} | {family} |"
+                f"| {name} | " + " | ".join(f"{n:,}" for n in counts) + f" | {max(r['error'] for r in own):.1e} |"
+            )
+        lines += [
+            "",
+            "Worst errors by family; how many have a G of rank below six, and how many of these have a margin:",
+            "",
+            "| family | grasps | of low rank | with margin | " + " | ".join(names) + " |",
+            "|---|---|---|---|" + "---|" * len(names),
+        ]
+        for family, r in found["costs"].items():
+            errors = (f"{found['accuracy'][name][family]['error']:.0e}" for name in names)
+            lines.append(
+                f"| {family} | {r['grasps']} | {r['deficient']} | {r['margin']} | " + " | ".join(errors) + " |"
             )
         lines.append("")
     if "costs" in found:
-        families = {family: r for family, r in found["costs"].items() if r["ratios"]}
+        families = {family: r for family, r in found["costs"].items() if family in COSTS}
         lines += [
             "## What each step costs",
             "",
@@ -268,9 +315,9 @@ def text(found: dict) -> str:
             "## Grasps a second",
             "",
             f"{s['grasps']} random grasps, four contacts, six directions, eight edges, no load; warm, by turns,",
-            f"best of {ROUNDS}. Peers have their programs ready made, one a direction where answers are free, and",
-            "tolerance 1e-6; ours makes them from contacts, to 1e-9, with bounds. In brackets: share solved, how far",
-            "from ours at most, of max(1, margin).",
+            f"best of {ROUNDS}. Peers run in a process a core and have their programs ready made, one a direction",
+            "where answers are free, and tolerance 1e-6; ours makes them from contacts, to 1e-9, with bounds. In",
+            "brackets: share solved, how far from ours at most, of max(1, margin).",
             "",
             "| formulation | jaxgrasp | best peer | times | all peers |",
             "|---|---|---|---|---|",
@@ -285,6 +332,17 @@ def text(found: dict) -> str:
             factor = "" if best is None else f"{ours / others[best]['per second']:.1f}"
             lines.append(f"| {name} | {ours:,.0f} | {best or ''} | {factor} | {cells} |")
         lines += ["", f"Load average before: {s['load']:.1f}.", ""]
+    if "compiling" in found:
+        lines += [
+            "## The first answer",
+            "",
+            "Seconds that a fresh process takes for 64 grasps, four contacts, six directions, float64, less imports.",
+            "",
+            "| formulation | nothing compiled before | kernels on disk |",
+            "|---|---|---|",
+        ]
+        lines += [f"| {name} | {cold:.1f} | {warm:.1f} |" for name, (cold, warm) in found["compiling"]["rows"].items()]
+        lines += ["", f"Load average before: {found['compiling']['load']:.1f}.", ""]
     lines += [
         f"{platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}, jax {jax.__version__}. Made by "
         "`python -m benchmarks.formulations`.",
@@ -307,13 +365,16 @@ def keep(more: dict) -> None:
         figure(found)
 
 
+PARTS = {"margins": margins, "edges": edges, "speed": speed, "compiling": compiling}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", default="margins,edges,speed")
+    parser.add_argument("--parts", default="margins,edges,speed,compiling")
     for part in parser.parse_args().parts.split(","):
         say(part)
         start = time.perf_counter()
-        keep({"margins": margins, "edges": edges, "speed": speed}[part]())
+        keep(PARTS[part]())
         say(f"  {time.perf_counter() - start:.0f} s")
 
 

@@ -6,7 +6,7 @@ every contact at rest and under every disturbance, tied by lambda; (16) the rows
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
@@ -75,6 +75,15 @@ class Case:
         """Whether some disturbance is outside the range of G."""
         missed = self.W + (self.answers[:-1]) @ self.G.T
         return bool(np.any(np.abs(missed).max(-1) > 1e-8 * np.abs(self.W).max(-1).clip(1e-300)))
+
+    @cached_property
+    def independent(self) -> np.ndarray:
+        """(r, 6): orthonormal combinations of the equalities that say all that they say.
+
+        Clarabel stalls on equalities that follow from each other.
+        """
+        U, s, _ = np.linalg.svd(np.column_stack([self.G, self.W.T, self.b]), full_matrices=False)
+        return U[:, s > RANK_TOLERANCE * s[0]].T
 
     @cached_property
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +216,10 @@ def exact(case: Case, norm_bound: bool = False) -> float:
     Where it fails on the whole program it is asked for f_0 and one direction at a time.
     """
     whole = _exact(case, case.W, norm_bound)
-    return whole if not np.isinf(whole) else np.min([_exact(case, w[None], norm_bound) for w in case.W])
+    if not np.isinf(whole):
+        return whole
+    each = [_exact(case, w[None], norm_bound) for w in case.W]
+    return np.inf if np.isinf(each).any() else np.min(each)
 
 
 def _exact(case: Case, W: np.ndarray, norm_bound: bool) -> float:
@@ -215,11 +227,12 @@ def _exact(case: Case, W: np.ndarray, norm_bound: bool) -> float:
     cones = case.cones(norm_bound)
     own = np.vstack([A for _, A, _ in cones])
     rows = sp.hstack([sp.block_diag([own] * count), sp.csr_matrix((count * len(own), 1))])
-    wrenches = np.vstack([W, np.zeros(6)]).reshape(-1, 1)
-    equal = sp.hstack([sp.block_diag([case.G] * count), sp.csr_matrix(wrenches)])
+    U = case.independent
+    wrenches = (np.vstack([W, np.zeros(6)]) @ U.T).reshape(-1, 1)
+    equal = sp.hstack([sp.block_diag([U @ case.G] * count), sp.csr_matrix(wrenches)])
     cost = np.zeros(count * size + 1)
     cost[-1] = -1
-    value = _by_clarabel(cost, rows, cones * count, equal, np.tile(case.b, count))
+    value = _by_clarabel(cost, rows, cones * count, equal, np.tile(U @ case.b, count))
     return value * case.scale if not value < -1e-7 else np.nan
 
 
@@ -232,8 +245,9 @@ def exact_fixed(case: Case, norm_bound: bool = False) -> float:
     rows = np.vstack([np.hstack([own, (own @ a)[:, None]]) for a in case.answers])
     cost = np.zeros(case.G.shape[1] + 1)
     cost[-1] = -1
-    equal = np.hstack([case.G, np.zeros((6, 1))])
-    value = _by_clarabel(cost, rows, cones * len(case.answers), equal, case.b)
+    U = case.independent
+    equal = np.hstack([U @ case.G, np.zeros((len(U), 1))])
+    value = _by_clarabel(cost, rows, cones * len(case.answers), equal, U @ case.b)
     return value * case.scale if not value < -1e-7 else np.nan
 
 
@@ -261,6 +275,9 @@ class Batch:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def __getitem__(self, rows) -> Batch:
+        return Batch(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
     def case(self, i: int, edges: int = 8) -> Case:
         """One of them."""
         wrenches = self.wrenches[i]
@@ -280,6 +297,7 @@ def sample(seed: int, count: int, n_c: int, n_d: int) -> Batch:
 
     A third without load, a third with a light and a third with a heavy one; one in eight has its contacts on one side,
     one in eight a contact twice, one in eight all in one line (rank 5); one in five has the six forces as disturbances.
+    Half of the grasps whose G is short of rank have their wrenches in its range.
     """
     rng = np.random.default_rng(seed)
     axes = rng.uniform(0.4, 1.0, (count, 1, 3))
@@ -303,14 +321,32 @@ def sample(seed: int, count: int, n_c: int, n_d: int) -> Batch:
     plain = np.arange(count) % 5 == 0
     wrenches[plain] = 0
     wrenches[plain, :6] = np.vstack([np.eye(6)[:3], -np.eye(6)[:3]])
+    positions, frames = 0.05 * u * axes, np.stack([t1, np.cross(normals, t1), normals], -1)
+    into = projections(positions, frames)
+    into[np.arange(count) // 8 % 2 > 0] = np.eye(6)
+    load, wrenches = np.einsum("nab,nb->na", into, load), np.einsum("nab,njb->nja", into, wrenches)
     return Batch(
-        0.05 * u * axes,
-        np.stack([t1, np.cross(normals, t1), normals], -1),
+        positions,
+        frames,
         np.exp(rng.uniform(np.log(0.2), np.log(1.2), (count, n_c))),
         max_force,
         wrenches,
         load,
     )
+
+
+def projections(positions: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Of wrenches onto the range of G, orthogonal for moments over 5 cm; exactly I where that is everything."""
+    moments = np.cross(positions[:, :, :, None], frames, axis=2) / 0.05
+    G = np.concatenate([frames, moments], 2).transpose(0, 2, 1, 3).reshape(len(positions), 6, -1)
+    units = np.diag(np.repeat([1.0, 0.05], 3))
+    out = np.tile(np.eye(6), (len(G), 1, 1))
+    for i, one in enumerate(G):
+        U, s, _ = np.linalg.svd(one)
+        keep = s > RANK_TOLERANCE * s[0]
+        if not keep.all():
+            out[i] = units @ U[:, keep] @ U[:, keep].T @ np.linalg.inv(units)
+    return out
 
 
 def recorded() -> Batch | None:
@@ -349,8 +385,9 @@ def least_total_effort(case: Case, margin: float) -> float:
             sp.hstack([sp.vstack([sp.csr_matrix(A)] * count), sp.block_diag([A] * count)]),
         ]
     )
-    equal = sp.block_diag([case.G] * (count + 1)).tocsr()
-    sides = np.concatenate([case.b, *(-margin / case.scale * case.W)])
+    U = case.independent
+    equal = sp.block_diag([U @ case.G] * (count + 1)).tocsr()
+    sides = np.concatenate([U @ case.b, *(-margin / case.scale * case.W @ U.T)])
     scale = weights.max()
     status, _, value = _clarabel(
         sp.diags(np.tile(weights / scale, count + 1)),

@@ -43,15 +43,26 @@ def programs(batch: chain.Batch, name: str) -> tuple[Programs, int]:
     return made, len(A) // len(batch)
 
 
-def linear(batch: chain.Batch, name: str) -> dict[str, Solve]:
+PEERS = {
+    **dict.fromkeys(("12", "12_fixed"), ("Clarabel",)),
+    **dict.fromkeys(("13", "16", "per_direction", "per_direction_prestrained"), ("HiGHS", "Clarabel", "PIQP")),
+    "11": ("Clarabel", "PIQP"),
+}
+"""By formulation."""
+
+
+def solver(batch: chain.Batch, name: str, label: str, margin: np.ndarray) -> Solve:
+    """One peer for a formulation; the margin is for (11) alone."""
+    if name == "11":
+        return {"Clarabel": effort_by_clarabel, "PIQP": effort_by_piqp}[label](*total_effort(batch, margin))
+    return conic(batch, name) if name in ("12", "12_fixed") else linear(batch, name, label)
+
+
+def linear(batch: chain.Batch, name: str, label: str) -> Solve:
     """Margins of a linear formulation."""
     made, each = programs(batch, name)
-
-    def least(solve: Solve) -> Solve:
-        return lambda: (solve() * made.scale).reshape(-1, each).min(-1)
-
-    solvers = {"HiGHS": peers.highs, "Clarabel": peers.clarabel, "PIQP": peers.piqp_dense}
-    return {label: least(make(made)) for label, make in solvers.items()}
+    solve = {"HiGHS": peers.highs, "Clarabel": peers.clarabel, "PIQP": peers.piqp_dense}[label](made)
+    return lambda: (solve() * made.scale).reshape(-1, each).min(-1)
 
 
 def _settings(tolerance: float) -> clarabel.DefaultSettings:
@@ -63,7 +74,7 @@ def _settings(tolerance: float) -> clarabel.DefaultSettings:
     return settings
 
 
-def conic(batch: chain.Batch, name: str) -> dict[str, Solve]:
+def conic(batch: chain.Batch, name: str) -> Solve:
     """Margins of (12), one program a direction, or with blocking forces, one program."""
     matrices, scale, kinds, sides = [], [], [], None
     for i in range(len(batch)):
@@ -99,11 +110,11 @@ def conic(batch: chain.Batch, name: str) -> dict[str, Solve]:
                 answers[i] = solution.x[-1]
         return (answers * scale).reshape(len(batch), -1).min(-1)
 
-    return {"Clarabel": solve}
+    return solve
 
 
-def total_effort(batch: chain.Batch, margin: np.ndarray) -> dict[str, Solve]:
-    """Efforts of (11) with Q = Q_0 = I."""
+def total_effort(batch: chain.Batch, margin: np.ndarray) -> tuple:
+    """(11) with Q = Q_0 = I: P, equalities and their right-hand sides of every grasp, rows and theirs, unit."""
     equal, sides, rows = [], [], None
     for i in range(len(batch)):
         case = batch.case(i)
@@ -118,16 +129,19 @@ def total_effort(batch: chain.Batch, margin: np.ndarray) -> dict[str, Solve]:
         block = slice(j * len(A), (j + 1) * len(A))
         rows[block, :size] = A
         rows[block, j * size : (j + 1) * size] = A
-    h, cost = np.tile(h, count + 1), np.zeros((count + 1) * size)
     P = sp.diags(weights / weights.max()).tocsc()
-    unit = weights.max()
+    return P, np.array(equal), np.array(sides), rows, np.tile(h, count + 1), weights.max()
 
-    values, pattern = peers.sparse(np.concatenate([np.array(equal), np.tile(rows, (len(batch), 1, 1))], 1))
+
+def effort_by_clarabel(P, equal, sides, rows, h, unit) -> Solve:
+    """Efforts of (11)."""
+    values, pattern = peers.sparse(np.concatenate([equal, np.tile(rows, (len(equal), 1, 1))], 1))
     kinds = [clarabel.ZeroConeT(len(sides[0])), clarabel.NonnegativeConeT(len(h))]
+    cost = np.zeros(P.shape[0])
     solver = clarabel.DefaultSolver(P, cost, pattern, np.r_[sides[0], h], kinds, _settings(peers.TOLERANCE))
 
-    def by_clarabel() -> np.ndarray:
-        answers = np.full(len(batch), np.nan)
+    def solve() -> np.ndarray:
+        answers = np.full(len(values), np.nan)
         for i, data in enumerate(values):
             solver.update(A=data, b=np.r_[sides[i], h])
             solution = solver.solve()
@@ -135,20 +149,25 @@ def total_effort(batch: chain.Batch, margin: np.ndarray) -> dict[str, Solve]:
                 answers[i] = solution.obj_val * unit
         return answers
 
-    piqp = importlib.import_module("piqp")
-    own, shape = peers.sparse(np.array(equal))
-    equalities = [sp.csc_matrix((data, shape.indices, shape.indptr), shape.shape) for data in own]
-    sparse = piqp.SparseSolver()
-    sparse.settings.eps_abs = sparse.settings.eps_rel = peers.TOLERANCE
-    sparse.setup(P, cost, equalities[0], sides[0], sp.csc_matrix(rows), None, h)
+    return solve
 
-    def by_piqp() -> np.ndarray:
-        answers = np.full(len(batch), np.nan)
+
+def effort_by_piqp(P, equal, sides, rows, h, unit) -> Solve:
+    """Efforts of (11)."""
+    piqp = importlib.import_module("piqp")
+    own, shape = peers.sparse(equal)
+    equalities = [sp.csc_matrix((data, shape.indices, shape.indptr), shape.shape) for data in own]
+    solver = piqp.SparseSolver()
+    solver.settings.eps_abs = solver.settings.eps_rel = peers.TOLERANCE
+    solver.setup(P, np.zeros(P.shape[0]), equalities[0], sides[0], sp.csc_matrix(rows), None, h)
+
+    def solve() -> np.ndarray:
+        answers = np.full(len(equal), np.nan)
         for i, matrix in enumerate(equalities):
-            sparse.update(A=matrix, b=sides[i])
-            if sparse.solve() == piqp.PIQP_SOLVED:
-                x = sparse.result.x
+            solver.update(A=matrix, b=sides[i])
+            if solver.solve() == piqp.PIQP_SOLVED:
+                x = solver.result.x
                 answers[i] = 0.5 * x @ (P @ x) * unit
         return answers
 
-    return {"Clarabel": by_clarabel, "PIQP": by_piqp}
+    return solve

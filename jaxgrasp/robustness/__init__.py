@@ -1,5 +1,6 @@
 """The paper: worst cases (17)-(18), margin (21), least effort (22), blocking forces (15), and the way to them."""
 
+from jaxgrasp.robustness.answers import FormulationSolution
 from jaxgrasp.robustness.blocking import blocking_forces
 from jaxgrasp.robustness.comparison import (
     Comparison,
@@ -7,7 +8,7 @@ from jaxgrasp.robustness.comparison import (
     compare_formulations,
     specified_disturbances,
 )
-from jaxgrasp.robustness.formulations import FormulationSolution, formulation_margin
+from jaxgrasp.robustness.formulations import formulation_margin
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening import largest_disturbance, least_effort
 from jaxgrasp.robustness.total_effort import TotalEffortSolution, least_total_effort

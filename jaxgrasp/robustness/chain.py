@@ -2,7 +2,8 @@
 
 Two shapes. Where the answer delta f_j to a disturbance is free, f_0 + delta f_j is a force of its own: the directions
 fall apart, one program each, max lambda with G f = b - lambda W_j, and f_0 another. Where delta f_j is the blocking
-force (15), one f_0 is shared: the rows come in copies, one for each direction and one for rest.
+force (15), one f_0 is shared. Coulomb's cones then come in copies, one for each direction and one for rest; of linear
+rows that differ only in what lambda takes from them, the strictest is enough, since lambda >= 0 is asked for.
 
 Per contact forces are scaled as in `program`: tangential by mu F, normal by F.
 """
@@ -123,7 +124,7 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
     """The programs of one formulation for a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
     count, lanes = basics.disturbed.shape
-    parts = _patterns(form.exact, cone_edges, norm_bound, grasps.friction)
+    parts = contact_rows(form.exact, cone_edges, norm_bound, grasps.friction)
     kinds = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
     if form.free:
         length = jnp.sqrt(lax.stop_gradient(fold(jnp.add, basics.targets * basics.targets)))
@@ -137,20 +138,21 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
         border = jnp.zeros((6, 1 if form.shared else count, lanes), dtype)
         given = jnp.moveaxis(basics.answers / basics.sizes, 0, 2)
         sigmas = [jnp.where(present[:, None] > 0, part.apply(given), 0) for part in parts]
+        if not form.exact:
+            # The strictest of all directions and of rest, for which it is 0.
+            sigmas = [jnp.maximum(sigma, 0) for sigma in sigmas]
+            sigmas = [jnp.max(sigma, 3, keepdims=True) if form.shared else sigma for sigma in sigmas]
         largest = fold(jnp.maximum, [jnp.max(jnp.abs(sigma), (0, 1, 2)) for sigma in sigmas])
-        if form.shared:
+        if form.shared and form.exact:
             largest = jnp.max(largest, 0, keepdims=True)
             # Directions become copies, (d, n_d, n, 1, *lanes).
             sigmas = [jnp.swapaxes(sigma, 1, 3) for sigma in sigmas]
         # Where nothing disturbs, lambda asks how deep inside all rows f_0 can be.
         idle = largest == 0
         scale = lax.stop_gradient(1 / jnp.where(idle, 1, largest))
-        sigmas = [
-            jnp.concatenate(
-                [jnp.where(idle, kind, sigma * scale), jnp.where(idle, kind, jnp.zeros_like(sigma[:, :1]))], 1
-            )
-            for sigma, kind in zip(sigmas, kinds, strict=True)
-        ]
+        if form.exact:
+            sigmas = [jnp.concatenate([sigma, jnp.zeros_like(sigma[:, :1])], 1) for sigma in sigmas]
+        sigmas = [jnp.where(idle, kind, sigma * scale) for sigma, kind in zip(sigmas, kinds, strict=True)]
     lift = lambda sigma: jnp.broadcast_to(sigma, (*sigma.shape[:3], *border.shape[1:]))  # noqa: E731
     problem = ConicMargin(
         rows=tuple(replace(part, sigma=lift(sigma)) for part, sigma in zip(parts, sigmas, strict=True)),
@@ -173,7 +175,7 @@ def blocking(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
     return jnp.where(grasps.present > 0, forces, 0)
 
 
-def _patterns(exact: bool, cone_edges: int, norm_bound: bool, friction: jax.Array) -> list[ConeRows]:
+def contact_rows(exact: bool, cone_edges: int, norm_bound: bool, friction: jax.Array) -> list[ConeRows]:
     """The rows of a contact, without sigma: friction, then the bound on the force."""
     none = jnp.zeros((1, 1, 1, 1, 1), friction.dtype)
     make = lambda kind, patterns, h, stretch=None: ConeRows(  # noqa: E731

@@ -8,11 +8,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxgrasp.arrays import literal
+from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.answers import FormulationSolution
 from jaxgrasp.robustness.chain import FORMULATIONS
-from jaxgrasp.robustness.formulations import Chain, FormulationSolution, check_vertices, formulation_margin, tile_of
+from jaxgrasp.robustness.formulations import Chain, check_vertices, formulation_margin, tile_of
 from jaxgrasp.robustness.grasps import over_grasps
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening import largest_disturbance
@@ -69,6 +71,7 @@ def compare_formulations(
     contacts: Contacts,
     disturbances: DisturbanceSet,
     required_wrench: ArrayLike | None = None,
+    compliance: ArrayLike | Compliance | None = None,
     cone_edges: int = 8,
     force_bound: str = "normal",
 ) -> Comparison:
@@ -81,6 +84,7 @@ def compare_formulations(
         contacts: the grasps; their dtype is the precision.
         disturbances: W_j, a single `DisturbanceSet.vertices` or `.forces`.
         required_wrench: b (*batch, 6), N and N m; None is zero.
+        compliance: Q of (14), as in `largest_disturbance`; only blocking forces depend on it.
         cone_edges: n_e of the inscribed pyramids.
         force_bound: "normal" or "norm", of "12" and "12_fixed".
 
@@ -98,9 +102,9 @@ def compare_formulations(
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
     kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", tile_of(contacts, disturbances))
-    found = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench)
+    found = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)
     own: dict[str, FormulationSolution] = {name: solution for name, (solution, _) in found.items()}
-    reduced = largest_disturbance(contacts, disturbances, required_wrench, cone_edges=cone_edges)
+    reduced = largest_disturbance(contacts, disturbances, required_wrench, compliance, cone_edges)
     solutions: dict[str, FormulationSolution | Solution] = {**own, "21": reduced}
     bindings = {name: Binding(direction=s.direction, contact=s.contact, row=s.row) for name, s in own.items()}
     bindings["21"] = _binding(contacts, reduced, own["16"], cone_edges)
@@ -186,6 +190,12 @@ def specified_disturbances(
 
     Raises:
         ValueError: shapes or options that do not fit; at trace time.
+
+    Status:
+        SOLVED (also where nothing disturbs); INFEASIBLE; otherwise as in `formulation_margin`.
+
+    Derivatives:
+        Of the margin, as in `formulation_margin`; forces count as constant.
     """
     if equation not in ("6", "9"):
         raise ValueError(f"equation: got {equation!r}, wanted '6' or '9'")

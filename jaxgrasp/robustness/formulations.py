@@ -8,13 +8,12 @@ They differ in what is admissible (Coulomb's cone or the inscribed pyramid; |f| 
 delta f_j is free or the blocking force (15).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import Compliance
@@ -22,52 +21,29 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices
-from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Formulation, Scaled, basics, scaled_formulation
+from jaxgrasp.robustness.answers import (
+    ACCEPTED,
+    FormulationSolution,
+    formulation_answer,
+    programs,
+    solved_program,
+)
+from jaxgrasp.robustness.chain import (
+    FORMULATIONS,
+    Basics,
+    Formulation,
+    Scaled,
+    basics,
+    contact_rows,
+    scaled_formulation,
+)
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along
-from jaxgrasp.solvers import embedding
-from jaxgrasp.solvers.conic_margin import ConicMargin
 from jaxgrasp.solvers.embedding import ConicOutcome
-from jaxgrasp.solvers.status import Status
+from jaxgrasp.solvers.lanes import Each
 
-_TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
 # Contacts under all directions in a tile.
 _TILE = 1024
-# Residuals and gaps that did not close to the tolerance still count as solved below this; less than this is zero.
-_ACCEPTED = {"float64": 1e-7, "float32": 3e-4}
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
-class FormulationSolution:
-    """What `formulation_margin` answers."""
-
-    margin: Float[Array, "*batch"]
-    """lambda >= 0; NaN where there is no answer, inf where nothing disturbs."""
-    upper_bound: Float[Array, "*batch"]
-    """Certified by multipliers: no forces whatever reach more."""
-    directions: Float[Array, "*batch directions"]
-    """The largest lambda of every direction by itself; where one program has all directions, its margin. inf for zero
-    wrenches."""
-    forces: Float[Array, "*batch contacts 3"]
-    """f_0, contact frames, N; for "per_direction_prestrained" that of the direction that binds. 0 for absent contacts,
-    NaN where there is none."""
-    disturbed_forces: Float[Array, "*batch directions contacts 3"]
-    """f_0 + delta f_j at lambda = margin, contact frames, N; NaN where there are none."""
-    status: Int[Array, "*batch"]
-    """`Status`."""
-    direction: Int[Array, "*batch"]
-    """The disturbance that binds, -1 where the forces at rest do or where there is no answer."""
-    contact: Int[Array, "*batch"]
-    """The contact that binds: of its rows one has the largest multiplier; -1 where there is no answer."""
-    row: Int[Array, "*batch"]
-    """The row of that contact: facets 0 .. n_e - 1, then the bound on the force; with exact cones 0 and 1."""
-    iterations: Int[Array, "*batch"]
-    """Interior-point steps, the most of any direction."""
-    primal_residual: Float[Array, "*batch"]
-    """Largest violation of any row or equality, forces in units of f_max (mu f_max along the surface)."""
-    gap: Float[Array, "*batch"]
-    """(upper_bound - margin) / max(scale, margin)."""
 
 
 def formulation_margin(
@@ -168,7 +144,12 @@ class Chain:
     @property
     def stages(self) -> tuple:
         """See `Kernel`."""
-        return (lambda grasps, _: (grasps, *self._scaled(grasps)), lambda given: self._solve(*given))
+        solved = [name for name in self.names if self._twin(name) == name]
+        return (
+            lambda grasps, _: self._programs(grasps),
+            Each(dict.fromkeys(solved, solved_program)),
+            lambda given: self._answers(*given),
+        )
 
     def tangents(self, along: Along, out: dict) -> dict:
         """See `Kernel`."""
@@ -198,12 +179,19 @@ class Chain:
         form = FORMULATIONS[name]
         return next(o for o in self.names if FORMULATIONS[o][:2] == form[:2] and (form.free or o == name))
 
-    def _solve(self, grasps: Grasps, shared: Basics, scaled: dict[str, Scaled]) -> dict:
-        solved = {name: outcome(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
+    def _programs(self, grasps: Grasps) -> tuple:
+        shared, scaled = self._scaled(grasps)
+        wanted = {name: programs(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
+        scales = {name: own.scale for name, own in scaled.items()}
+        return (replace(grasps, terms=(), extents=()), shared, scales), wanted
+
+    def _answers(self, kept: tuple, solved: dict[str, ConicOutcome]) -> dict:
+        grasps, shared, scales = kept
         answers = {}
         for name in self.names:
-            twin = self._twin(name)
-            solution = formulation_answer(grasps, shared, scaled[twin], FORMULATIONS[name], solved[twin])
+            twin, form = self._twin(name), FORMULATIONS[name]
+            rows = contact_rows(form.exact, self.cone_edges, self.norm_bound and form.exact, grasps.friction)
+            solution = formulation_answer(grasps, shared, scales[twin], rows, form, solved[twin])
             answers[name] = solution, solved[twin].point
         return answers
 
@@ -234,121 +222,10 @@ def _program_weights(solution: FormulationSolution, cotangents: tuple, scaled: S
     if cotangents[1] is not None:
         given = given + cotangents[1]
     # What is zero is flat, or zero by definition.
-    least = _ACCEPTED[scale.dtype.name] * (scale if scale.shape[0] == 1 else scale[: given.shape[0]])
+    least = ACCEPTED[scale.dtype.name] * (scale if scale.shape[0] == 1 else scale[: given.shape[0]])
     given = jnp.where(jnp.isfinite(directions) & (directions > least), given, 0)
     if form.free:
         given = jnp.concatenate([given, jnp.zeros_like(given[:1])])
     elif form.shared:
         given = fold(jnp.add, given)[None]
     return given * scale
-
-
-def outcome(grasps: Grasps, shared: Basics, scaled: Scaled, free: bool) -> ConicOutcome:
-    """Solve all programs of a formulation but those whose answer is known; point leaves (..., D, *lanes)."""
-    runs = jnp.broadcast_to(grasps.valid & ~shared.load_outside, scaled.scale.shape)
-    if free:
-        there = shared.disturbed & ~shared.outside
-        runs &= jnp.concatenate([there, jnp.ones_like(there[:1])])
-    return embedding.solve(scaled.problem, _TOLERANCE[scaled.scale.dtype.name], runs)
-
-
-def formulation_answer(
-    grasps: Grasps, shared: Basics, scaled: Scaled, form: Formulation, out: ConicOutcome
-) -> FormulationSolution:
-    """What the outcome of its programs says about a formulation."""
-    accepted, scale = _ACCEPTED[scaled.scale.dtype.name], scaled.scale
-    value, bound = jnp.minimum(out.point.margin, out.upper), out.upper
-    solved = (out.error <= accepted) & ~out.infeasible
-    # What is zero to the tolerance is zero.
-    value = jnp.where(solved & (jnp.abs(value) <= accepted), jnp.maximum(value, 0), value)
-    hopeless = out.infeasible | (solved & (value < 0)) | (bound < -accepted)
-    infeasible, unknown = _verdict(shared, form, solved | hopeless, hopeless)
-
-    def each_direction(values: jax.Array) -> jax.Array:
-        values = values * scale
-        own = jnp.broadcast_to(
-            values[: 1 if values.shape[0] == 1 else shared.disturbed.shape[0]], shared.disturbed.shape
-        )
-        return jnp.where(shared.outside, 0, jnp.where(shared.disturbed, own, jnp.inf))
-
-    directions, upper = each_direction(value), each_direction(bound)
-    undisturbed = ~shared.disturbed.any(0)
-    status = jnp.select(
-        [~grasps.valid, shared.load_outside | infeasible, unknown, undisturbed],
-        [Status.INVALID_INPUT, Status.INFEASIBLE, Status.MAX_ITERATIONS, Status.UNBOUNDED],
-        Status.SOLVED,
-    ).astype(jnp.int32)
-    answered = (status == Status.SOLVED) | (status == Status.UNBOUNDED)
-    hide = lambda v: jnp.where(answered, v, jnp.nan)  # noqa: E731
-    margin, worst = jnp.min(directions, 0), jnp.argmin(directions, 0)
-    upper = jnp.maximum(jnp.min(upper, 0), margin)
-    program = worst if scale.shape[0] > 1 else jnp.zeros_like(worst)
-    forces, disturbed = _forces(shared, form, out.point.x, directions, margin, program)
-    finite = answered & ~undisturbed & ~shared.outside.any(0)
-    direction, contact, row = _binding(scaled.problem, form, out.point.z, program)
-    told = lambda v: jnp.where(finite, v, -1).astype(jnp.int32)  # noqa: E731
-    return FormulationSolution(
-        margin=hide(margin),
-        upper_bound=hide(upper),
-        directions=hide(directions),
-        forces=hide(jnp.moveaxis(forces * grasps.present, 1, 0)),
-        disturbed_forces=hide(jnp.moveaxis(disturbed * grasps.present, 2, 1)),
-        status=status,
-        direction=told(direction),
-        contact=told(contact),
-        row=told(row),
-        iterations=jnp.max(out.iterations, 0),
-        primal_residual=hide(jnp.max(jnp.where(out.iterations > 0, out.residual, 0), 0)),
-        gap=hide(jnp.where(finite, (upper - margin) / jnp.maximum(_pick(scale, program), margin), 0)),
-    )
-
-
-def _verdict(shared: Basics, form: Formulation, known: jax.Array, hopeless: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whether there are no admissible forces, and whether that cannot be told, (*lanes)."""
-    if not form.free:
-        return hopeless.any(0), ~known.all(0)
-    there, idle = shared.disturbed & ~shared.outside, ~shared.disturbed.any(0)
-    fails, told = hopeless[:-1] & there, (known[:-1] | ~there).all(0)
-    no_rest, rest_known = hopeless[-1], known[-1]
-    if form.shared:
-        # With an f_0, each direction has forces for lambda = 0 at least.
-        return no_rest, ~rest_known | ~no_rest & (~told | fails.any(0))
-    # Of a direction that contact forces do not reach, nothing can be borne, and that by an f_0.
-    by_rest = shared.outside.any(0) | idle
-    return fails.any(0) | by_rest & no_rest, ~told | by_rest & ~rest_known
-
-
-def _forces(
-    shared: Basics, form: Formulation, x: jax.Array, directions: jax.Array, margin: jax.Array, program: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """f_0 (3, n, *lanes) and f_0 + delta f_j at the margin (n_d, 3, n, *lanes), N, of x (3, n, D, *lanes)."""
-    own = jnp.moveaxis(x, 2, 0) * shared.sizes
-    if form.free:
-        # On the way from f_0 to what bears the most that this direction allows.
-        some = jnp.isfinite(directions) & (directions > 0)
-        share = jnp.where(some, margin / jnp.where(some, directions, 1), 0)
-        return own[-1], own[-1] + share[:, None, None] * (own[:-1] - own[-1])
-    return _pick(own, program), own + jnp.where(jnp.isfinite(margin), margin, 0) * shared.answers
-
-
-def _pick(values: jax.Array, program: jax.Array) -> jax.Array:
-    """Of (D, ..., *lanes) what belongs to the program, (..., *lanes)."""
-    index = program.reshape(*[1] * (values.ndim - 1), -1)
-    return jnp.take_along_axis(values, jnp.broadcast_to(index, (1, *values.shape[1:-1], index.shape[-1])), 0)[0]
-
-
-def _binding(
-    problem: ConicMargin, form: Formulation, z: tuple[jax.Array, ...], program: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Direction, contact and row of the largest multiplier of the program that binds; direction -1 for rest."""
-    # (d, J, n, *lanes) each; of a second-order cone the head is the size of the whole.
-    own = [_pick(jnp.moveaxis(z_p, 3, 0), program) for z_p in z]
-    own = [z_p[:1] if part.second_order else z_p for part, z_p in zip(problem.rows, own, strict=True)]
-    rows = jnp.concatenate(own)
-    _, copies, n, lanes = rows.shape
-    where = jnp.argmax(rows.reshape(-1, lanes), 0)
-    row, copy, contact = where // (copies * n), where // n % copies, where % n
-    if form.free:
-        return program, contact, row
-    # The last copy is rest.
-    return jnp.where(copy == copies - 1, -1, copy if form.shared else program), contact, row

@@ -1,6 +1,6 @@
 """The least-effort program (11) over the tightening forces and all answers to the disturbances."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -12,15 +12,19 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.robustness.chain import FORMULATIONS, Basics, Scaled, basics, scaled_formulation
-from jaxgrasp.robustness.formulations import FormulationSolution, check_vertices, formulation_answer, outcome, tile_of
+from jaxgrasp.robustness.answers import Verdict, programs, solved_program, verdict
+from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formulation
+from jaxgrasp.robustness.formulations import check_vertices, tile_of
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.arrow_problem import ArrowProblem, ArrowRecord, patterns_of
+from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.interior_point import Settings
+from jaxgrasp.solvers.lanes import Each
 from jaxgrasp.solvers.status import Status
 
+_FREE = FORMULATIONS["13"]
 _SETTINGS = {
     "float64": Settings(
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
@@ -30,6 +34,8 @@ _SETTINGS = {
     ),
 }
 _ACCEPTED = {"float64": 1e-7, "float32": 1e-3}
+# Wrenches up to this, in units of the mean of f_max.
+_NOTHING = {"float64": 1e-8, "float32": 1e-5}
 
 
 @jax.tree_util.register_dataclass
@@ -110,7 +116,8 @@ class _TotalEffort(OfPyramids):
     @property
     def stages(self) -> tuple:
         return (
-            lambda grasps, _: (grasps, *self._free(grasps)),
+            lambda grasps, _: self._free(grasps),
+            Each({"13": solved_program}),
             lambda given: self._start(*given),
             lambda given: self._solve(*given),
         )
@@ -121,28 +128,33 @@ class _TotalEffort(OfPyramids):
         moved = {"effort": change, "lower_bound": change}
         return TotalEffortSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), ArrowRecord(*[None] * 5)
 
-    def _free(self, grasps: Grasps) -> tuple[Basics, Scaled]:
+    def _free(self, grasps: Grasps) -> tuple:
         shared = basics(grasps, False)
-        return shared, scaled_formulation(grasps, shared, FORMULATIONS["13"], self.cone_edges, False)
+        scaled = scaled_formulation(grasps, shared, _FREE, self.cone_edges, False)
+        kept = replace(grasps, terms=(), extents=()), shared, scaled.scale
+        return kept, {"13": programs(grasps, shared, scaled, True)}
 
-    def _start(self, grasps: Grasps, shared: Basics, free: Scaled) -> tuple:
-        found = outcome(grasps, shared, free, True)
-        answer = formulation_answer(grasps, shared, free, FORMULATIONS["13"], found)
+    def _start(self, kept: tuple, solved: dict[str, ConicOutcome]) -> tuple:
+        grasps, shared, scale = kept
+        found = solved["13"]
+        answer = verdict(grasps, shared, scale, _FREE, found)
         # Each direction on its way from f_0 to the most that it allows: inside the rows.
-        some = jnp.isfinite(answer.directions) & (answer.directions > 0)
+        some = answer.answered & jnp.isfinite(answer.directions) & (answer.directions > 0)
         share = jnp.where(some, grasps.margin / jnp.where(some, answer.directions, 1), 0)
         x, rest = found.point.x, found.point.x[:, :, -1:]
         guess = jnp.concatenate([rest + jnp.clip(share, 0, 1) * (x[:, :, :-1] - rest), rest], 2)
         return grasps, shared, answer, guess
 
-    def _solve(self, grasps: Grasps, shared: Basics, answer: FormulationSolution, guess: jax.Array) -> tuple:
+    def _solve(self, grasps: Grasps, shared: Basics, answer: Verdict, guess: jax.Array) -> tuple:
         problem, unit = _problem(grasps, shared, self.cone_edges, guess)
         dtype = unit.dtype.name
         settings = _SETTINGS[dtype]
-        bearable = (answer.status == Status.SOLVED) | (answer.status == Status.UNBOUNDED)
-        active = bearable & (grasps.margin <= answer.upper_bound * (1 + settings.tolerance))
-        # Without a load and disturbances no forces at all are the answer, exactly.
-        idle = active & (problem.rhs == 0).all((0, 1))
+        bearable = answer.answered
+        most = jnp.maximum(jnp.min(answer.upper, 0), jnp.min(answer.directions, 0))
+        active = bearable & (grasps.margin <= most * (1 + settings.tolerance))
+        # Without a load and disturbances no forces at all are the answer. What rounding leaves of nothing counts as
+        # nothing: a grasp that withstands none has no room inside its rows.
+        idle = active & (jnp.abs(problem.rhs) <= _NOTHING[dtype]).all((0, 1))
         out = interior_point.solve(problem, settings, active & ~idle)
         record = jax.tree.map(lambda v: jnp.where(idle, 0, v), out.record)
         gap = (record.upper - record.lower) / problem.gap_scale(record)

@@ -2,11 +2,12 @@
 
 A kernel is a function of arrays whose last axis is the lane; a leaf that all lanes share has a last axis of size 1. On
 CPUs it becomes native code where it can, see `kernels`; else XLA cuts the lanes into tiles that stay in the cache.
-Elsewhere they go at once.
+Elsewhere they go at once. A kernel may have a stage with more lanes, one for each of several programs of a lane.
 """
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -29,8 +30,22 @@ LARGEST_LEAF = 1 << 15
 LARGE_TILE = 1 << 17
 
 
+@dataclass(frozen=True)
+class Each:
+    """A stage that works on several programs of every lane, as lanes of their own.
+
+    It takes and returns (kept, {name: tree}): what is kept passes by; leaves of the trees have an axis of programs
+    before the lanes, of size 1 where they share the leaf. The functions by name see one lane axis.
+    """
+
+    functions: dict[str, Callable[[Tree], Tree]]
+
+
+Stage = Callable[[Tree], Tree] | Each
+
+
 def map_lanes(
-    stages: tuple[Callable[[Tree], Tree], ...],
+    stages: tuple[Stage, ...],
     arguments: Tree,
     shared: Tree,
     rows: int,
@@ -43,7 +58,8 @@ def map_lanes(
 
     Args:
         stages: the kernel, in parts that are compiled by themselves and at the same time: the first takes the tree of
-            arguments with the lane axis last (size 1 where shared), each other one what the one before returns.
+            arguments with the lane axis last (size 1 where shared), each other one what the one before returns. What is
+            between two `Each` becomes native code by itself, and so does every function of an `Each`.
         arguments: leaves (lanes, ...), or without the leading axis where shared.
         shared: like arguments, bool: the leaf is the same for all lanes.
         compact: the kernel is free of library calls and large reductions, so that a stage of a tile can be one function
@@ -56,12 +72,39 @@ def map_lanes(
         What the last stage returns, leaves (lanes, ...).
     """
     leaves, structure = jax.tree.flatten(arguments)
-    flags, rows = tuple(jax.tree.leaves(shared)), rows if compact else 0
+    alike = jax.tree.leaves(shared)
     if any(x.size == 0 for x in leaves):
-        one = [x if s else jnp.zeros((1, *x.shape[1:]), x.dtype) for x, s in zip(leaves, flags, strict=True)]
-        shapes = jax.eval_shape(_run(stages, structure, flags, 0, tile, None), one)
-        return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), shapes)
-    return _run(stages, structure, flags, rows, tile, known_as and f"{known_as} {structure}")(leaves)
+        one = [x if s else jnp.zeros((1, *x.shape[1:]), x.dtype) for x, s in zip(leaves, alike, strict=True)]
+        again = lambda one: map_lanes(  # noqa: E731
+            stages, jax.tree.unflatten(structure, one), shared, rows, compact=compact, tile=tile
+        )
+        return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), jax.eval_shape(again, one))
+    rows = rows if compact else 0
+    run: list[Callable] = []
+    named = lambda part: known_as and f"{known_as} {part} {structure}"  # noqa: E731
+    for number, stage in enumerate(stages):
+        if not isinstance(stage, Each):
+            run.append(stage)
+            continue
+        kept, programs = _run(tuple(run), structure, tuple(alike), rows, tile, named(f"to {number}"))(leaves)
+        solved = {
+            name: _of_programs(stage.functions[name], own, tile, known_as and f"{known_as} {number} {name}")
+            for name, own in programs.items()
+        }
+        leaves, structure = jax.tree.flatten((kept, solved))
+        alike, run = [False] * len(leaves), []
+    return _run(tuple(run), structure, tuple(alike), rows, tile, named("to the end"))(leaves)
+
+
+def _of_programs(function: Callable[[Tree], Tree], programs: Tree, tile: int, known_as: str | None) -> Tree:
+    """Leaves (lanes, ..., programs)."""
+    leaves, structure = jax.tree.flatten(programs)
+    lanes, count = leaves[0].shape[0], max(x.shape[-1] for x in leaves)
+    spread = [jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], count)), -1, 1) for x in leaves]
+    flat = [x.reshape(lanes * count, *x.shape[2:]) for x in spread]
+    name = known_as and f"{known_as} {structure}"
+    out = _run((function,), structure, (False,) * len(leaves), 0, tile * count, name)(flat)
+    return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(lanes, count, *x.shape[1:]), 1, -1), out)
 
 
 def _run(
@@ -123,7 +166,8 @@ def tiled(
         return first([x[..., None] if s else jnp.moveaxis(x, 0, -1) for x, s in zip(parts, shared, strict=True)])
 
     def leave(value: Tree) -> Tree:
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), value)
+        lanes = max(x.shape[-1] for x in jax.tree.leaves(value))
+        return jax.tree.map(lambda x: jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], lanes)), -1, 0), value)
 
     steps = [enter, *stages[1:]]
     steps[-1] = lambda value, last=steps[-1]: leave(last(value))
