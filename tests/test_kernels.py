@@ -367,6 +367,7 @@ def test_outlines_are_data():
     assert jax.tree.structure(again) == jax.tree.structure(tree)
     for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(tree), strict=True):
         assert one.shape == other.shape and one.dtype == other.dtype
+    assert outline.read(outline.written({"edges": 8})) == {"edges": 8}
     for content in (
         b'{"class": ["os", "system"], "fields": {"command": null}}',
         b'{"class": ["jaxgrasp.kernels.machine", "keep"], "fields": {"key": null, "objects": null}}',

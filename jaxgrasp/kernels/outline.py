@@ -11,10 +11,10 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 def written(tree: Any) -> bytes:
-    """A tree of arrays; their contents are left out.
+    """A tree of arrays, whose contents are left out, and of what is not traced in records: numbers and words.
 
     Raises:
-        TypeError: something in it is neither an array nor None, a container, or a record of this package.
+        TypeError: something in it is none of these, a container, or a record of this package.
     """
     return json.dumps(_told(tree)).encode()
 
@@ -34,6 +34,8 @@ def read(content: bytes) -> Any:
 def _told(x: Any) -> Any:
     if x is None:
         return None
+    if isinstance(x, bool | int | float | str):
+        return {"plain": x}
     if isinstance(x, np.ndarray):
         return {"shape": x.shape, "dtype": x.dtype.name}
     if isinstance(x, dict):
@@ -50,6 +52,8 @@ def _told(x: Any) -> Any:
 def _made(x: Any) -> Any:
     if x is None:
         return None
+    if "plain" in x:
+        return x["plain"]
     if "shape" in x:
         return np.empty(x["shape"], x["dtype"])
     if "dict" in x:
