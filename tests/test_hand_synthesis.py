@@ -121,6 +121,15 @@ def test_what_was_found_before_an_interrupt_is_kept(hand, found):
     np.testing.assert_array_equal(partly.record["margin"], found.record["margin"][: STEPS // 2])
 
 
+@pytest.mark.thorough
+def test_torque_limits_count_on_the_way(hand, found):
+    limited = synthesize_hand_grasps(hand, jax.random.key(0), starts=STARTS, steps=STEPS, torque_limits=True)
+    assert limited.good.mean() >= 0.9
+    # The first margins are those of the same starts, with less that the hand can do.
+    assert (limited.record["margin"][0] <= found.record["margin"][0] + 1e-4).all()
+    assert np.median(limited.margin[limited.good]) >= 0.9 * np.median(found.margin[found.good])
+
+
 def test_retraction_is_that_of_mujoco(hand):
     around, random = Surroundings.of(hand), np.random.default_rng(1)
     qpos = random_starts(around, 20, random)
