@@ -13,7 +13,7 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.hands import HandObject, scenes
 from jaxgrasp.hands.self_collision import self_pairs
 from jaxgrasp.hands.surroundings import Surroundings
-from jaxgrasp.synthesis import Verdict, Weights, synthesize_hand_grasps
+from jaxgrasp.synthesis import Verdict, Weights, hand_grasps, synthesize_hand_grasps
 from jaxgrasp.synthesis.hand_descent import retracted
 from jaxgrasp.synthesis.hand_energy import Task, terms_of
 from jaxgrasp.synthesis.hand_starts import random_starts
@@ -128,6 +128,15 @@ def test_torque_limits_count_on_the_way(hand, found):
     # The first margins are those of the same starts, with less that the hand can do.
     assert (limited.record["margin"][0] <= found.record["margin"][0] + 1e-4).all()
     assert np.median(limited.margin[limited.good]) >= 0.9 * np.median(found.margin[found.good])
+
+
+def test_an_interrupt_before_anything_is_found_is_one(hand, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(hand_grasps, "advance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        synthesize_hand_grasps(hand, jax.random.key(0), starts=STARTS, steps=STEPS)
 
 
 def test_retraction_is_that_of_mujoco(hand):

@@ -105,9 +105,6 @@ class SceneSynthesis(HandScene):
                 )
         except ValueError as error:
             raise CommandError(f"--scene {self.scene}: {error}") from error
-        if not len(found.qpos):
-            print("jaxgrasp: interrupted before the first step, nothing was written", file=sys.stderr)
-            return 130
         kept = np.flatnonzero(found.good) if self.keep is None else found.diverse(self.keep, self.diversity)
         written, failed = self._write(hand, found, found.take(kept), unit, output, figure)
         print_hand_synthesis(found, len(kept), self._name, unit, written)

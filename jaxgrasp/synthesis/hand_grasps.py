@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from jaxgrasp.arrays import as_float
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.hands import HandObject, close_fingers
+from jaxgrasp.hands import HandObject
 from jaxgrasp.hands.surroundings import Surroundings
 from jaxgrasp.synthesis.hand_descent import CHUNK, State, advance
 from jaxgrasp.synthesis.hand_energy import Task, Terms, Weights
-from jaxgrasp.synthesis.hand_judgement import Judgement, Verdict, judged
+from jaxgrasp.synthesis.hand_judgement import Judgement, Verdict, closed, judged, padded
 from jaxgrasp.synthesis.hand_starts import random_starts
 
 # Starts at a time: what is done of one batch is not lost with the next.
@@ -115,7 +115,8 @@ def synthesize_hand_grasps(
             the record of the batch.
 
     Returns:
-        HandSynthesis, all starts. Ctrl-C ends the descent early: what there is by then is judged and returned.
+        HandSynthesis, all starts. Ctrl-C ends the descent early: what there is after the first steps is judged and
+        returned.
 
     Raises:
         ValueError: Options that cannot be used, a hand that cannot close or cannot be moved.
@@ -141,12 +142,11 @@ def synthesize_hand_grasps(
     )
     begin = random_starts(around, starts, np.random.default_rng(np.asarray(jax.random.key_data(key))))
     ends, record = _descend(around, begin, task, steps, torque_limits, progress)
-    closed = np.asarray(close_fingers(hand, _padded(ends, len(begin))))[: len(ends)]
     weight = hand.object_mass * float(np.linalg.norm(hand.model.opt.gravity))
     wanted = jnp.asarray(2 * weight if squeeze is None else squeeze, float)
-    judge = lambda qpos: judged(around, qpos, disturbances, min_contacts, wanted)  # noqa: E731
-    first = judge(np.asarray(close_fingers(hand, begin))[: len(ends)])
-    found = judge(closed)
+    first, found = (
+        judged(around, closed(around, qpos), disturbances, min_contacts, wanted) for qpos in (begin[: len(ends)], ends)
+    )
     order = np.lexsort((-np.nan_to_num(found.margin, nan=-np.inf), found.verdict != Verdict.GOOD))
     return HandSynthesis(
         **{f.name: getattr(found, f.name)[order] for f in fields(Judgement)},
@@ -165,39 +165,35 @@ def _descend(
     torque_limits: bool,
     progress: Callable[[int, int, dict[str, np.ndarray]], None] | None,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Where the starts end, of those that were reached before Ctrl-C, and the record."""
+    """Where the starts end, of those that had taken some steps before Ctrl-C, and the record."""
     mesh = Mesh(np.array(jax.local_devices()), ("starts",))
     batches = -(-len(begin) // _BATCH)
     size = -(-len(begin) // batches // mesh.size) * mesh.size
     single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), task)
     spread, shared = NamedSharding(mesh, PartitionSpec("starts")), NamedSharding(mesh, PartitionSpec())
     single = jax.device_put(single, shared)
-    ends, courses = [], []
+    ends, courses = {}, {}
     try:
         for batch in range(batches):
-            rows = _padded(begin[batch * size : (batch + 1) * size], size)
-            state = State.from_starts(around, jnp.asarray(rows, jnp.float32))
-            state = jax.device_put(state, spread)
-            ends.append(rows)
-            courses.append([])
+            rows = padded(begin[batch * size : (batch + 1) * size], size)
+            state = jax.device_put(State.from_starts(around, jnp.asarray(rows, jnp.float32)), spread)
             for number in range(0, steps, CHUNK):
                 state, terms = advance(state, single, jnp.asarray(number), around, torque_limits, mesh)
-                ends[-1] = np.asarray(state.qpos, float)
-                courses[-1].append(jax.tree.map(np.asarray, terms))
+                ends[batch] = np.asarray(state.qpos, float)
+                courses.setdefault(batch, []).append(jax.tree.map(np.asarray, terms))
                 if progress is not None:
                     done = batch * steps + min(number + CHUNK, steps)
-                    progress(done, batches * steps, _recorded(courses[-1:], task.weights, steps))
+                    progress(done, batches * steps, _recorded([courses[batch]], task.weights, steps))
     except KeyboardInterrupt:
-        pass
-    found = np.concatenate(ends)[: len(begin)] if ends else begin[:0]
-    return _normalised(around, found), _recorded(courses, task.weights, steps)
+        if not ends:
+            raise
+    found = np.concatenate(list(ends.values()))[: len(begin)]
+    return _normalised(around, found), _recorded(list(courses.values()), task.weights, steps)
 
 
 def _recorded(courses: list[list[Terms]], weights: Weights, steps: int) -> dict[str, np.ndarray]:
     """Quantiles of the weighted terms over the starts of all batches, as far as all of these have come."""
-    whole = [jax.tree.map(lambda *parts: np.concatenate(parts)[:steps], *course) for course in courses if course]
-    if not whole:
-        return {name: np.zeros((0, len(QUANTILES))) for name in Terms._fields}
+    whole = [jax.tree.map(lambda *parts: np.concatenate(parts)[:steps], *course) for course in courses]
     least = min(len(terms.distance) for terms in whole)
     return {
         name: float(getattr(weights, name))
@@ -211,8 +207,3 @@ def _normalised(around: Surroundings, qpos: np.ndarray) -> np.ndarray:
     qpos, at = np.array(qpos, float), around.pose + 3
     qpos[:, at : at + 4] /= np.linalg.norm(qpos[:, at : at + 4], axis=-1, keepdims=True)
     return qpos
-
-
-def _padded(rows: np.ndarray, count: int) -> np.ndarray:
-    """Filled up with rows that are there already, so that one compilation serves all."""
-    return rows[np.arange(count) % max(len(rows), 1)]

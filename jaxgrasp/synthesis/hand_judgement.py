@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgrasp.compiling import compiled
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.hands import close_fingers
 from jaxgrasp.hands.squeezing import opened, squeezed
 from jaxgrasp.hands.surroundings import Surroundings
 from jaxgrasp.robustness import largest_disturbance, least_effort
@@ -76,6 +77,18 @@ class Judgement:
     told apart."""
 
 
+def closed(around: Surroundings, qpos: Float[np.ndarray, "grasps nq"]) -> Float[np.ndarray, "grasps nq"]:
+    """The configurations with the fingers closed until they touch."""
+    size = min(_TILE, len(qpos))
+    tiles = [qpos[first : first + size] for first in range(0, len(qpos), size)]
+    return np.concatenate([np.asarray(close_fingers(around.hand, padded(t, size)))[: len(t)] for t in tiles])
+
+
+def padded(rows: np.ndarray, count: int) -> np.ndarray:
+    """Filled up with rows that are there already, so that one compilation serves all."""
+    return rows[np.arange(count) % len(rows)]
+
+
 def judged(
     around: Surroundings,
     qpos: Float[np.ndarray, "grasps nq"],
@@ -95,8 +108,7 @@ def judged(
     count, size = len(qpos), min(_TILE, len(qpos))
     parts = []
     for first in range(0, count, size):
-        # The last tile is filled up, so that one compilation serves all.
-        rows = qpos[np.arange(first, first + size) % count]
+        rows = padded(qpos[first : first + size], size)
         found = _judged(around, jnp.asarray(rows), disturbances, squeeze)
         parts.append({name: np.asarray(x)[: count - first] for name, x in found.items()})
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
