@@ -108,9 +108,9 @@ def synthesize_hand_grasps(
         starts: How many.
         steps: Of each.
         min_contacts: With fewer a grasp is not good.
-        squeeze: The margin for which the commands are found by (22), as far as a grasp has `SHARE` of it; None is twice
-            the object's weight. Soft servos give way under forces that cancel each other, and turn the object out of
-            the grasp: more is not better.
+        squeeze: The margin for which the commands are found by (22), or nine tenths of the grasp's own where that is
+            less; None is as many as twice the object's weight has newtons. Soft servos give way under forces that
+            cancel each other, and turn the object out of the grasp: more is not better.
         progress: Called every few steps with the numbers of steps done and to be done, over all batches of starts, and
             the record of the batch.
 
