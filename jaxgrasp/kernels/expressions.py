@@ -154,8 +154,10 @@ class Builder:
                 for x, y, known in ((a, b, left), (b, a, right)):
                     if known and x in (0, 1, -1):
                         return x * x.dtype.type(0) if x == 0 else y if x == 1 else self.make("neg", y)
-                if type(a) is Value and type(b) is Value and a.op == b.op == "neg":
-                    return self.make("mul", a.args[0], b.args[0])
+                # Signs go outwards, where a sum takes them up.
+                for x, y in ((a, b), (b, a)):
+                    if type(x) is Value and x.op == "neg":
+                        return self.make("neg", self.make("mul", x.args[0], y))
             elif op == "add":
                 if left and a == 0:
                     return b
@@ -172,6 +174,8 @@ class Builder:
                     return self.make("neg", b)
                 if not right and b.op == "neg":
                     return self.make("add", a, b.args[0])
+                if not left and a.op == "neg":
+                    return self.make("neg", self.make("add", a.args[0], b))
             elif right and b != 0 and np.isfinite(b):
                 return self.make("mul", a, (1 / b).astype(b.dtype))
             elif not (left and a == 1):
@@ -197,8 +201,12 @@ class Builder:
             inner = args[1]
             if type(inner) is Value and inner.op == "select" and inner.args[2] is args[2]:
                 return self.make("select", self.make("and", args[0], inner.args[0]), inner.args[1], args[2])
-        elif op in ("max", "min") and args[0] is args[1]:
-            return args[0]
+        elif op in ("max", "min"):
+            if args[0] is args[1]:
+                return args[0]
+            if all(type(x) is Value and x.op == "neg" for x in args):
+                other = "min" if op == "max" else "max"
+                return self.make("neg", self.make(other, args[0].args[0], args[1].args[0]))
         return None
 
 

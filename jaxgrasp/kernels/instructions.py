@@ -147,41 +147,45 @@ class Instructions:
         self.declare(f"declare {vector} {full}({vector}, {vector}, {mask})")
         return self.emit(f"call {vector} {full}({vector} {x}, {vector} zeroinitializer, {mask} -1)")
 
-    def sound(self, refined: str, estimate: str) -> str:
-        """The refined value; where that is NaN (x is zero, infinite or NaN), the estimate, which is exact there."""
-        lost = self.emit(f"fcmp uno {self.types['f']} {refined}, {refined}")
-        return self.emit(f"select {self.types['b']} {lost}, {self.types['f']} {estimate}, {self.types['f']} {refined}")
+    def improved(self, inverse: str, lacking: str, step: str, exact: str | None = None) -> tuple[str, str]:
+        """One step of Newton's; none where the estimate is exact: x is zero, infinite or NaN, or as good as that.
+
+        Args:
+            inverse: what is improved.
+            lacking: by which share it is short.
+            step: what a unit of this share is worth.
+            exact: where it is to be done, if that is known already.
+        """
+        vector = self.types["f"]
+        mask = exact or self.emit(f"fcmp ogt {vector} {lacking}, {self.constant(-1, 'f')}")
+        better = self.multiply_add(step, lacking, inverse)
+        return self.emit(f"select {self.types['b']} {mask}, {vector} {better}, {vector} {inverse}"), mask
 
     def reciprocal(self, x: str) -> str:
         """The reciprocal 1 / x."""
         one = self.constant(1, "f")
         if not self.estimates:
             return self.emit(f"fdiv {self.types['f']} {one}, {x}")
-        first = inverse = self.estimate("rcp", x)
-        minus = self.negative(x)
+        inverse, minus, mask = self.estimate("rcp", x), self.negative(x), None
         for _ in range(2 if self.dtype.itemsize == 8 else 1):
-            lacking = self.multiply_add(minus, inverse, one)
-            inverse = self.multiply_add(inverse, lacking, inverse)
-        return self.sound(inverse, first)
+            inverse, mask = self.improved(inverse, self.multiply_add(minus, inverse, one), inverse, mask)
+        return inverse
 
     def inverse_root(self, x: str) -> str:
         """1 / sqrt(x)."""
         if not self.estimates:
             return self.reciprocal(self.intrinsic("sqrt", x))
-        return self.sound(*self.refined_inverse_root(x))
-
-    def refined_inverse_root(self, x: str) -> tuple[str, str]:
-        """1 / sqrt(x), NaN where x is zero or infinite, and the estimate of it."""
-        first = inverse = self.estimate("rsqrt", x)
+        inverse, mask = self.estimate("rsqrt", x), None
         for _ in range(2 if self.dtype.itemsize == 8 else 1):
             # In this order nothing is too small for an ordinary number.
-            lacking = self.multiply_add(self.negative(self.times(x, inverse)), inverse, self.constant(1, "f"))
-            inverse = self.multiply_add(self.times(inverse, self.constant(0.5, "f")), lacking, inverse)
-        return inverse, first
+            minus = self.negative(self.times(x, inverse))
+            lacking = self.multiply_add(minus, inverse, self.constant(1, "f"))
+            inverse, mask = self.improved(inverse, lacking, self.times(inverse, self.constant(0.5, "f")), mask)
+        return inverse
 
     def root(self, x: str) -> str:
         """The root: x / sqrt(x), and one step towards the root."""
-        inverse, _ = self.refined_inverse_root(x)
+        inverse = self.inverse_root(x)
         root = self.times(x, inverse)
         lacking = self.multiply_add(self.negative(root), root, x)
         root = self.multiply_add(lacking, self.times(inverse, self.constant(0.5, "f")), root)

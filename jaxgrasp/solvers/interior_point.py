@@ -217,29 +217,38 @@ def _predict_correct(
     factors = problem.factor(weights)
 
     @fenced
-    def blocking(rows: Tree, shift: Tree, weights: Tree, lacking: Tree, inverse_s: Tree, inverse_z: Tree) -> tuple:
-        """ds, dz and the reciprocals of the steps that reach the boundary."""
+    def towards_optimum(z: Tree, rows: Tree, weights: Tree, lacking: Tree, inverse_s: Tree) -> tuple:
+        """The affine ds and dz, and the reciprocals of the steps that reach the boundary; dz / z is -1 - ds / s."""
         ds = jax.tree.map(lambda r, a: -r - a, lacking, rows)
-        dz = jax.tree.map(lambda e, w, a: e + w * a, shift, weights, rows)
-        primal = reduce_rows(jnp.maximum, jax.tree.map(lambda d, i: -d * i, ds, inverse_s), lanes)
-        dual = reduce_rows(jnp.maximum, jax.tree.map(lambda d, i: -d * i, dz, inverse_z), lanes)
+        dz = jax.tree.map(lambda z, w, d: -(z + w * d), z, weights, ds)
+        relative = jax.tree.map(jnp.multiply, ds, inverse_s)
+        primal, dual = -reduce_rows(jnp.minimum, relative, lanes), 1 + reduce_rows(jnp.maximum, relative, lanes)
         if settings.equal_steps:
             primal = dual = jnp.maximum(primal, dual)
         return ds, dz, primal, dual
 
     @fenced
-    def correct(
-        iterate: Iterate, affine: Iterate, primal: jax.Array, dual: jax.Array, mu: jax.Array, inverse_s: Tree
-    ) -> Tree:
+    def blocking(rows: Tree, shift: Tree, weights: Tree, lacking: Tree, inverse_s: Tree, inverse_z: Tree) -> tuple:
+        """ds, dz and the reciprocals of the steps that reach the boundary."""
+        ds = jax.tree.map(lambda r, a: -r - a, lacking, rows)
+        dz = jax.tree.map(lambda e, w, a: e + w * a, shift, weights, rows)
+        primal = -reduce_rows(jnp.minimum, jax.tree.map(jnp.multiply, ds, inverse_s), lanes)
+        dual = -reduce_rows(jnp.minimum, jax.tree.map(jnp.multiply, dz, inverse_z), lanes)
+        if settings.equal_steps:
+            primal = dual = jnp.maximum(primal, dual)
+        return ds, dz, primal, dual
+
+    @fenced
+    def correct(iterate: Iterate, ds: Tree, dz: Tree, primal: jax.Array, dual: jax.Array, mu: jax.Array) -> Tree:
         """The corrector's shift: aim at sigma mu and make up for the second-order term ds dz."""
         primal, dual = 1 / jnp.maximum(primal, 1), 1 / jnp.maximum(dual, 1)
-        reached = jax.tree.map(
-            lambda s, z, ds, dz: (s + primal * ds) * (z + dual * dz), iterate.s, iterate.z, affine.s, affine.z
-        )
-        ratio = inverse_count * reduce_rows(jnp.add, reached, lanes) / mu
+        # The mean of (s + primal ds) (z + dual dz), of which s z + z ds + s dz is zero.
+        along = inverse_count * _product(iterate.z, ds, lanes)
+        across = inverse_count * _product(ds, dz, lanes)
+        ratio = ((1 - dual) * mu + (primal - dual) * along + primal * dual * across) / mu
         aim = jnp.maximum(ratio * ratio * ratio * mu, settings.mu_floor)
         return jax.tree.map(
-            lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, affine.s, affine.z, inverse_s, present
+            lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, ds, dz, inverse_s, present
         )
 
     @fenced
@@ -255,18 +264,19 @@ def _predict_correct(
         mu_new = _product(new.s, new.z, lanes) * inverse_count
         if settings.safeguard:
             low = settings.safeguard * mu_new
-            kept_s = jax.tree.map(lambda s, z, p: jnp.maximum(s, low / (z + (1 - p)) * p), new.s, new.z, present)
-            kept_z = jax.tree.map(lambda s, z, p: jnp.maximum(z, low / s * p), new.s, new.z, present)
+            guarded = jax.tree.map(lambda z, p: z + (1 - p), new.z, present)
+            raised = jax.tree.map(lambda s, g, p: low * p / (s * g), new.s, guarded, present)
+            kept_s = jax.tree.map(lambda s, r: s * jnp.maximum(1, r), new.s, raised)
+            kept_z = jax.tree.map(lambda z, r: z * jnp.maximum(1, r), new.z, raised)
             new = new._replace(s=kept_s, z=kept_z)
         return new, mu_new
 
-    def direction(problem: Problem, shift: Tree) -> tuple[Iterate, jax.Array, jax.Array]:
-        dx, dy, rows = problem.solve(factors, residuals, shift)
-        ds, dz, primal, dual = blocking(rows, shift, weights, residuals.rows, inverse_s, inverse_z)
-        return Iterate(dx, dy, ds, dz), primal, dual
-
-    shift = correct(iterate, *direction(problem.predictor, affine_shift), mu, inverse_s)
-    return advance(iterate, *direction(problem, shift), mu)
+    _, _, rows = problem.predictor.solve(factors, residuals, affine_shift)
+    affine = towards_optimum(iterate.z, rows, weights, residuals.rows, inverse_s)
+    shift = correct(iterate, *affine, mu)
+    dx, dy, rows = problem.solve(factors, residuals, shift)
+    ds, dz, primal, dual = blocking(rows, shift, weights, residuals.rows, inverse_s, inverse_z)
+    return advance(iterate, Iterate(dx, dy, ds, dz), primal, dual, mu)
 
 
 def _axpy(step: jax.Array, direction: Tree, point: Tree) -> Tree:
