@@ -3,8 +3,8 @@
     python -m benchmarks.kernels [--quick]
 
 writes kernels.md beside itself (--quick: fewer shapes, writes nothing). Floating-point operations are counted in the
-kernel's own program: a loop's as often as the mean lane goes round; the peak is that of NumPy's matrix product in the
-same run. Every figure is the best of several rounds by turns, warm.
+kernel's own program: a loop's as often as the mean lane goes round; the peak is the rate of a kernel that does nothing
+but multiply and add, in the same run. Every figure is the best of several rounds by turns, warm.
 """
 
 from __future__ import annotations
@@ -85,7 +85,10 @@ def margins(contacts: jg.Contacts, disturbances: jg.DisturbanceSet, edges: int =
 
 
 def job(function):
-    return lambda: jax.block_until_ready(function()) and None
+    def run() -> None:
+        jax.block_until_ready(function())
+
+    return run
 
 
 def on_xla(function, *args):
@@ -132,9 +135,29 @@ def flops(jaxpr, shared, iterations: float) -> float:
     return total
 
 
-def product(size: int, dtype: str):
-    matrix = np.full((size, size), 0.5, dtype)
-    return lambda: np.matmul(matrix, matrix) is None
+CHAINS, IN_TURN, LOOPS = 16, 64, 50
+
+
+def multiply_adds(batch: int, dtype: str):
+    """Nothing but multiplications that are part of an addition, as many at a time as registers hold; and how many."""
+
+    def function(parts):
+        (x,) = parts
+
+        def more(_, chains):
+            for _ in range(IN_TURN):
+                chains = tuple(v * x + x for v in chains)
+            return chains
+
+        return sum(jax.lax.fori_loop(0, LOOPS, more, tuple(x * (1 + i) for i in range(CHAINS))))
+
+    halves = jax.numpy.full(batch, 0.5, dtype)
+    run = jax.jit(lambda x: kernels.fused(function, [x], (False,), no_kernel))
+    return job(functools.partial(run, halves)), 2.0 * batch * CHAINS * IN_TURN * LOOPS
+
+
+def no_kernel(_leaves):
+    raise AssertionError("there is a fused kernel")
 
 
 def headline(batches) -> list[str]:
@@ -186,7 +209,7 @@ def shapes(chosen) -> list[str]:
     lines = [
         "## Numbers of contacts and edges",
         "",
-        f"Batch {BATCHES[0]:,}, the six forces. Operations of the mean grasp, against a matrix product's rate.",
+        f"Batch {BATCHES[0]:,}, the six forces. Operations of the mean grasp, against a kernel that only multiplies and adds.",
         "",
         "| contacts | edges | precision | grasps/s | steps | flop | Gflop/s | of the peak | compile, s | disk, ms |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -205,10 +228,10 @@ def shapes(chosen) -> list[str]:
             jaxpr, shared = seen[0]
             cold, warm = compile_seconds(jaxpr, shared)
             work = flops(jaxpr, shared, steps)
-            size = 2048
-            timings = by_turns({"margins": job(solve), "product": product(size, dtype)}, ROUNDS)
+            peak_job, peak_work = multiply_adds(BATCHES[0], dtype)
+            timings = by_turns({"margins": job(solve), "peak": peak_job}, ROUNDS)
             rate = BATCHES[0] / timings["margins"].seconds
-            peak = 2 * size**3 / timings["product"].seconds
+            peak = peak_work / timings["peak"].seconds
             lines.append(
                 f"| {contacts_count} | {edges} | {dtype} | {rate:,.0f} | {steps:.2f} | {work:,.0f} | "
                 f"{rate * work / 1e9:.1f} | {rate * work / peak:.2f} | {cold:.1f} | {1e3 * warm:.0f} |"
@@ -230,7 +253,7 @@ def around() -> list[str]:
         "| precision | | times the margin under six forces |",
         "| --- | --- | --- |",
     ]
-    tail = ["", "| precision | S_1 and S_2, 4,096 directions | of the peak |", "| --- | --- | --- |"]
+    tail = ["", "| precision | S_1 and S_2, 4,096 directions | peak | of the peak |", "| --- | --- | --- | --- |"]
     for dtype in DTYPES:
         contacts = contacts_of(grasps, dtype)
         forces = jg.DisturbanceSet.forces(1.0)
@@ -252,15 +275,17 @@ def around() -> list[str]:
             "ball": job(margins(contacts, ball)),
             "six forces": job(margins(contacts, forces)),
             "directions": job(lambda: jg.worst_case(contacts, many)),  # noqa: B023
-            "product": product(2048, dtype),
         }
+        jobs["peak"], peak_work = multiply_adds(batch, dtype)
+        with watched() as seen:
+            jg.worst_case(contacts, many)
         timings = by_turns(jobs, ROUNDS)
         for name, base in (("margin with gradient", "margin"), ("box", "six forces"), ("ball", "six forces")):
             lines.append(f"| {dtype} | {name} | {timings[name].seconds / timings[base].seconds:.2f} |")
-        work = batch * 2 * 6 * 4 * 9 * len(directions)
-        peak = 2 * 2048**3 / timings["product"].seconds
-        rate = work / timings["directions"].seconds
-        tail.append(f"| {dtype} | {batch / timings['directions'].seconds:,.0f} grasps/s | {rate / peak:.2f} |")
+        peak = peak_work / timings["peak"].seconds
+        rate = batch / timings["directions"].seconds
+        share = rate * flops(*seen[-1], 1.0) / peak
+        tail.append(f"| {dtype} | {rate:,.0f} grasps/s | {1e-9 * peak:,.0f} Gflop/s | {share:.2f} |")
     return [*lines, *tail, ""]
 
 

@@ -19,6 +19,9 @@ SAME_MARGIN = 2e-8
 STATIONARITY = 1e-6
 """Of the terms that cancel in the gradient of the Lagrangian, which the method drives to zero with the gap."""
 
+KAPPA = 1e-4
+"""What s z is in a row of the smoothed program, in units of the margin."""
+
 LANES_A_FAMILY = 8
 FAMILIES = ("plain", "around", "light load", "uneven", "one side", "torques")
 
@@ -55,6 +58,19 @@ def plain(batch):
 
 def assert_same(batch: problems.Batch, ours: np.ndarray, other: np.ndarray) -> None:
     assert np.all(np.abs(ours - other) <= SAME_MARGIN * unit_of(batch, ours, other))
+
+
+def test_a_smoothed_margin_is_below_the_exact_one_by_kappa_a_row_at_most():
+    contacts, forces = harness.data_of(sample(families=("plain", "around")))[:2]
+    exact = jg.largest_disturbance(contacts, forces)
+    smooth = jg.largest_disturbance(contacts, forces, smoothing=KAPPA)
+    assert (smooth.status == exact.status).all()
+    held = np.asarray(exact.margin > 100 * KAPPA)
+    short = np.asarray(exact.margin - smooth.margin)[held]
+    rows = 9 * contacts.friction.shape[-1]
+    assert held.sum() > 8
+    assert (short > 0).all()
+    assert (short < 1.01 * rows * KAPPA).all()
 
 
 def test_force_limits_and_loads_scale_the_margin(batch, plain):

@@ -138,6 +138,11 @@ def _pack(code: VectorCode, source: str, lanes: list[str], count: int, kind: str
 
         _in_strides(code, count, some)
         return place
+    if 1 < count and kind != "b":
+        rows = [_first_entries(code, start, vector, count) for start in starts]
+        for j, column in enumerate(_transposed(code, rows, vector)[:count]):
+            code.do(f"store {vector} {column}, ptr {code.entry(place, vector, j)}, align 4")
+        return place
 
     def one(entry: str | int) -> None:
         byte = "byte" if kind == "b" else kind
@@ -171,14 +176,37 @@ def _unpack(code: VectorCode, place: str, target: str, lanes: list[str], count: 
 
         _in_strides(code, count, some)
         return
-    for entry in range(count):
-        column = code.emit(f"load {vector}, ptr {code.entry(place, vector, entry)}, align 1")
-        if count == 1:
-            code.do(f"store {vector} {column}, ptr {start}, align 1")
-            return
-        for lane in range(width):
-            scalar = code.emit(f"extractelement {vector} {column}, i64 {lane}")
-            code.do(f"store {unit} {scalar}, ptr {code.entry(start, unit, lane * count + entry)}")
+    columns = [code.emit(f"load {vector}, ptr {code.entry(place, vector, j)}, align 1") for j in range(count)]
+    if count == 1:
+        code.do(f"store {vector} {columns[0]}, ptr {start}, align 1")
+        return
+    for lane, row in enumerate(_transposed(code, columns + ["poison"] * (width - count), vector)):
+        # Each row covers what is too much of the one before; the last ones must not reach beyond the block.
+        if lane * count + width <= width * count:
+            code.do(f"store {vector} {row}, ptr {code.entry(start, unit, lane * count)}, align 1")
+        else:
+            _store_first_entries(code, row, code.entry(start, unit, lane * count), vector, count)
+
+
+def _first_entries(code: VectorCode, source: str, vector: str, count: int) -> str:
+    """The first entries of a vector in memory, and nothing of what is behind them."""
+    name, mask = _masked(code, "load", vector, f"ptr, i32, {code.types['b']}, {vector}", vector, count)
+    return code.emit(f"call {vector} {name}(ptr {source}, i32 1, {mask}, {vector} poison)")
+
+
+def _store_first_entries(code: VectorCode, row: str, target: str, vector: str, count: int) -> None:
+    """The first entries of a vector, to memory."""
+    name, mask = _masked(code, "store", vector, f"{vector}, ptr, i32, {code.types['b']}", "void", count)
+    code.do(f"call void {name}({vector} {row}, ptr {target}, i32 1, {mask})")
+
+
+def _masked(code: VectorCode, what: str, vector: str, arguments: str, result: str, count: int) -> tuple[str, str]:
+    """One of LLVM's functions for parts of vectors, and a mask for the first entries."""
+    unit = {"double": "f64", "float": "f32", "i32": "i32", "i8": "i8"}[vector.split(" x ")[1].rstrip(">")]
+    name = f"@llvm.masked.{what}.v{code.width}{unit}.p0"
+    code.declare(f"declare {result} {name}({arguments})")
+    flags = ", ".join(f"i1 {'true' if j < count else 'false'}" for j in range(code.width))
+    return name, f"{code.types['b']} <{flags}>"
 
 
 def _unpack_some(code: VectorCode, place: str, target: str, first: str, valid: str, count: int, kind: str) -> None:

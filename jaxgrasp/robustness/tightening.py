@@ -321,7 +321,9 @@ def _at_centre(grasps: Grasps, program: Program, iterate: Iterate, solution: Sol
     margin = jnp.where(program.slippery, jnp.minimum(point.margin, 0), point.margin)
     values = point._replace(margin=margin)._asdict()
     found = values.pop("usable")
-    kept = {name: jnp.where(found, value, getattr(solution, name)) for name, value in values.items()}
+    kept = {
+        name: jnp.where(found, value, getattr(solution, name)) for name, value in values.items() if value is not None
+    }
     proven = solution.status == Status.INFEASIBLE
     status = jnp.where(found & ~proven, Status.SOLVED, solution.status)
     status = jnp.where(possible & ~found & ~proven, Status.MAX_ITERATIONS, status)
