@@ -96,11 +96,11 @@ def _directions(inverse: jax.Array, friction: jax.Array, units: jax.Array, cone_
 
     @fenced
     def spread(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
-        c, s, k = literal(pyramid_facets(cone_edges).T, inverse.dtype)[..., None, None]
+        c, s, k = literal(-pyramid_facets(cone_edges).T, inverse.dtype)[..., None, None]
 
         def component(each_wrench: tuple) -> jax.Array:
             inverse, unit = each_wrench
-            cone = -(c * inverse[0] + s * inverse[1] + (k * friction) * inverse[2])
+            cone = c * inverse[0] + s * inverse[1] + (k * friction) * inverse[2]
             return jnp.concatenate([cone, inverse[2:]]) * unit
 
         return each(component, (jnp.moveaxis(inverse[:, :6], 1, 0), units))
