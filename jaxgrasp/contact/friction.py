@@ -24,5 +24,13 @@ def pyramid_facets(cone_edges: int) -> np.ndarray:
     """
     if int(cone_edges) != cone_edges or cone_edges < 3:
         raise ValueError(f"cone_edges: got {cone_edges}, wanted an integer of at least 3")
-    angles = math.pi * (2 * np.arange(cone_edges) + 1) / cone_edges
-    return np.stack([np.cos(angles), np.sin(angles), np.full(cone_edges, math.cos(math.pi / cone_edges))], -1)
+    halfway = 2 * (2 * np.arange(cone_edges) + 1)
+    cosines = [_cosine(angle, cone_edges) for angle in (halfway, halfway - cone_edges, np.full_like(halfway, 2))]
+    return np.stack(cosines, -1)
+
+
+def _cosine(angle: np.ndarray, cone_edges: int) -> np.ndarray:
+    """Of angles counted in pi / (2 n_e); the same to the last bit, but for its sign, wherever it is so on paper."""
+    angle = np.abs((angle + 2 * cone_edges) % (4 * cone_edges) - 2 * cone_edges)
+    acute = np.minimum(angle, 2 * cone_edges - angle)
+    return np.where(angle == acute, 1, -1) * np.sin(math.pi * (cone_edges - acute) / (2 * cone_edges))

@@ -158,6 +158,12 @@ class Builder:
                 for x, y in ((a, b), (b, a)):
                     if type(x) is Value and x.op == "neg":
                         return self.make("neg", self.make("mul", x.args[0], y))
+                    if type(x) is not Value and x < 0:
+                        return self.make("neg", self.make("mul", -x, y))
+                    if type(x) is not Value and y.op == "mul" and type(y.args[0]) is not Value:
+                        both = x * y.args[0]
+                        if np.isfinite(both) and abs(both) >= np.finfo(both.dtype).tiny:
+                            return self.make("mul", both, y.args[1])
             elif op == "add":
                 if left and a == 0:
                     return b

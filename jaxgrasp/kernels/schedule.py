@@ -63,7 +63,7 @@ def scheduled(program: Program) -> Schedule:
 
 
 # Values that wait for their turn beside each other, and how long a value takes, in values.
-_WINDOW = 16
+_WINDOW = 64
 _LATENCY = {"div": 14, "rsqrt": 18, "sqrt": 24}
 
 

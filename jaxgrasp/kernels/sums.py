@@ -1,7 +1,8 @@
 """Sums of products as chains: each product but the first is then part of an addition, rounded once.
 
 Programs add in pairs, for XLA; but only one of the two products of a pair can be part of their sum. Along a chain the
-additions wait for each other, which costs nothing, since there are always others to do.
+additions wait for each other, which costs nothing, since there are always others to do. Of terms that have a constant
+in common, it is taken out: processors add beside multiplying, and multiplications are what takes the time.
 """
 
 from collections import Counter
@@ -56,6 +57,7 @@ def _chain(root: Value, count: Counter[Value], left: list[Value]) -> None:
             stack += [(second, positive == (x.op == "add")), (first, positive)]
         else:
             terms.append((x, positive))
+    terms = _constants_taken_out(terms, root, count, left)
     products = [t for t in terms if type(t[0]) is Value and t[0].op == "mul" and _belongs(t[0], root, count)]
     if len(terms) < 3 or len(products) < 2:
         left += parts
@@ -65,6 +67,49 @@ def _chain(root: Value, count: Counter[Value], left: list[Value]) -> None:
     ordered = _positive_first([t for t in terms if id(t[0]) not in chosen] + products)
     root.op, root.args = _added(ordered, root, left)
     left.append(root)
+
+
+def _constants_taken_out(
+    terms: list[tuple[Any, bool]], root: Value, count: Counter[Value], left: list[Value]
+) -> list[tuple[Any, bool]]:
+    """Terms, those with the same constant as one: it times their sum."""
+    alike: dict[Any, list[tuple[Any, bool]]] = {}
+    kept: list[tuple[Any, bool]] = []
+    for x, positive in terms:
+        constant, other = _constant_of(x, root, count)
+        if constant is None:
+            kept.append((x, positive))
+        else:
+            alike.setdefault(constant, []).append((x, other, positive))
+    for constant, some in alike.items():
+        if len(some) == 1:
+            kept.append((some[0][0], some[0][2]))
+            continue
+        sign = any(positive for *_, positive in some)
+        parts = []
+        for _, other, positive in some:
+            if isinstance(other, tuple):
+                other = Value("mul", other, "f", root.region)
+                count[other] = 1
+            parts.append((other, positive == sign))
+        total = _value(_positive_first(parts), root, left)
+        product = Value("mul", (constant, total), "f", root.region)
+        count[product] = count[total] = 1
+        kept.append((product, sign))
+    return kept
+
+
+def _constant_of(x: Any, root: Value, count: Counter[Value]) -> tuple[Any, Any]:
+    """What a product has of a constant, and the rest: a value, or the factors of a new product."""
+    if type(x) is not Value or x.op != "mul" or not _belongs(x, root, count):
+        return None, None
+    first, second = x.args
+    if type(first) is not Value:
+        return first, second
+    for factor, other in ((first, second), (second, first)):
+        if factor.op == "mul" and type(factor.args[0]) is not Value and _belongs(factor, root, count):
+            return factor.args[0], (factor.args[1], other)
+    return None, None
 
 
 def _positive_first(terms: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
