@@ -209,7 +209,7 @@ def shapes(chosen) -> list[str]:
     lines = [
         "## Numbers of contacts and edges",
         "",
-        f"Batch {BATCHES[0]:,}, the six forces. Operations of the mean grasp, against a kernel that only multiplies and adds.",
+        f"Batch {BATCHES[0]:,}, the six forces. Operations of the mean grasp, against nothing but multiply-adds.",
         "",
         "| contacts | edges | precision | grasps/s | steps | flop | Gflop/s | of the peak | compile, s | disk, ms |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",

@@ -148,6 +148,30 @@ def test_loops_end_for_each_problem_by_itself():
     assert_same(function, jnp.exp(5 * rows(50, 1)))
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("count", [1, 5, 16, 37, 400])
+def test_problems_that_take_longer_wait_for_each_other(count, dtype):
+    """What a problem has of every kind goes with it, before, in and after the loop; and so does its row."""
+
+    def function(start, marks, table):
+        known = jnp.sqrt(jnp.abs(start)) + table[1]
+
+        def body(state):
+            total, step, odd = state
+            return total * 0.5 + known + jnp.where(marks[0], table[0], 0), step + 1, odd ^ marks
+
+        def unfinished(state):
+            return jnp.any(state[1] < jnp.asarray(7 * jnp.abs(start[0]), jnp.int32))
+
+        total, step, odd = lax.while_loop(unfinished, body, (start * 2, jnp.zeros(1, jnp.int32), marks))
+        return {"total": total - start, "known": known, "step": step, "odd": odd, "marks": ~marks}
+
+    start = rows(count, 3, dtype=dtype)
+    marks = jnp.asarray(np.random.default_rng(1).random((count, 2)) < 0.5)
+    table = rows(2, 1, dtype=dtype, seed=2)
+    assert_same(function, start, marks, table, shared=(False, False, True))
+
+
 def test_loops_of_known_length_and_branches():
     def function(x):
         turned = lax.fori_loop(0, 40, lambda i, y: y * 0.9 + x, jnp.zeros_like(x))

@@ -12,6 +12,7 @@ from jaxgrasp.kernels.handler import HANDLER
 from jaxgrasp.kernels.lowering import Program
 from jaxgrasp.kernels.schedule import scheduled
 from jaxgrasp.kernels.vector_code import VectorCode
+from jaxgrasp.kernels.waiting import blocks
 
 # Bytes of a block's arguments and results on the stack of a thread.
 _MOST_STACK = 1 << 19
@@ -35,12 +36,16 @@ def module(program: Program, name: str, width: int, *, estimates: bool) -> str:
         Unsupported: a block's data are too large, or of a type that is not known.
     """
     code = VectorCode(program.builder.dtype, width, estimates=estimates)
-    _block(program, code)
-    body = "\n".join(["entry:", *code.stack(), *code.lines])
+    code.begun = lambda: _shared(program, code)
+    results = _block(program, code)
+    _unpacking(program, code, results)
     count = len(program.inputs) + len(program.outputs)
     values = {
         "@NAME@": f"@{name}",
-        "@BODY@": body,
+        "@FUNCTIONS@": code.written(),
+        "@BLOCK@": blocks(code),
+        "@FRAME_BYTES@": str(max(code.used, 64)),
+        "@BOOK@": str(1 + 3 * width),
         "@DECLARATIONS@": "\n".join(sorted(code.declarations)),
         "@STATE_BYTES@": str(8 * (_POINTERS + count)),
         "@ARGUMENTS@": str(len(program.inputs)),
@@ -55,8 +60,17 @@ def module(program: Program, name: str, width: int, *, estimates: bool) -> str:
     return text
 
 
-def _block(program: Program, code: VectorCode) -> None:
-    """One block of problems: %state is the call's data, %block its number."""
+def _shared(program: Program, code: VectorCode) -> None:
+    """Every function reads where the arguments lie that all problems share."""
+    code.shared = [_pointer(code, number) if shared else "" for number, shared in enumerate(program.shared)]
+
+
+def _block(program: Program, code: VectorCode) -> list[tuple[str, int, str]]:
+    """One block of problems, from arguments to results in its frame; where these lie, how many and of which kind.
+
+    Three functions where a program has one loop of unknown length: `before`, its `rounds` and `after`; else `before`
+    is all.
+    """
     width = code.width
     size = width * program.builder.dtype.itemsize
     for _, dtype in program.inputs + program.out_avals:
@@ -65,6 +79,7 @@ def _block(program: Program, code: VectorCode) -> None:
     own = sum(math.prod(s) for (s, _), shared in zip(program.inputs, program.shared, strict=True) if not shared)
     if (own + sum(x.size for x in program.outputs)) * size > _MOST_STACK:
         raise Unsupported("data too large for a thread's stack")
+    code.begin("void @before(ptr noalias %state, i64 %block, ptr noalias %frame)")
     rows = code.emit("load i64, ptr %state")
     first = code.emit(f"mul i64 %block, {width}")
     last = code.emit(f"sub i64 {rows}, 1")
@@ -74,13 +89,8 @@ def _block(program: Program, code: VectorCode) -> None:
         inside = code.emit(f"icmp ult i64 {row}, {rows}")
         lanes.append(code.emit(f"select i1 {inside}, i64 {row}, i64 {last}"))
     for number, ((shape, dtype), shared) in enumerate(zip(program.inputs, program.shared, strict=True)):
-        pointer = _pointer(code, number)
-        if shared:
-            code.shared.append(pointer)
-            code.own.append("")
-        else:
-            code.shared.append("")
-            code.own.append(_pack(code, pointer, lanes, math.prod(shape), kind_of(dtype)))
+        code.sizes.append(math.prod(shape))
+        code.own.append("" if shared else _pack(code, _pointer(code, number), lanes, code.sizes[-1], kind_of(dtype)))
     results = []
     for out, (_, dtype) in zip(program.outputs, program.out_avals, strict=True):
         kind = "byte" if dtype.kind == "b" else kind_of(dtype)
@@ -97,20 +107,38 @@ def _block(program: Program, code: VectorCode) -> None:
         code.do(f"store {code.types[kind]} {name}, ptr {code.entry(place, code.types[kind], entry)}, align {width}")
 
     code.follow(scheduled(program), store, 26 if width * program.builder.dtype.itemsize == 64 else 11)
-    beyond = code.emit(f"add i64 {first}, {width}")
+    code.do("ret void")
+    return results
+
+
+def _unpacking(program: Program, code: VectorCode, results: list[tuple[str, int, str]]) -> None:
+    """From frames to results: of a block, whose last lanes may be empty, and of lanes from anywhere."""
+    pointers = range(len(program.inputs), len(program.inputs) + len(results))
+    code.begin("void @unpack(ptr noalias %state, i64 %block, ptr noalias %frame)")
+    rows = code.emit("load i64, ptr %state")
+    first = code.emit(f"mul i64 %block, {code.width}")
+    beyond = code.emit(f"add i64 {first}, {code.width}")
     full = code.emit(f"icmp ule i64 {beyond}, {rows}")
     whole, part, done = code.label("whole"), code.label("part"), code.label("done")
     code.do(f"br i1 {full}, label %{whole}, label %{part}")
     code.enter(whole)
-    for number, (place, count, kind) in enumerate(results):
-        _unpack(code, place, _pointer(code, len(program.inputs) + number), lanes, count, kind)
+    for number, (place, count, kind) in zip(pointers, results, strict=True):
+        _unpack(code, place, _pointer(code, number), first, count, kind)
     code.do(f"br label %{done}")
     code.enter(part)
     valid = code.emit(f"sub i64 {rows}, {first}")
-    for number, (place, count, kind) in enumerate(results):
-        _unpack_some(code, place, _pointer(code, len(program.inputs) + number), first, valid, count, kind)
+    for number, (place, count, kind) in zip(pointers, results, strict=True):
+        row_of = lambda lane: code.emit(f"add i64 {first}, {lane}")  # noqa: E731
+        _unpack_some(code, place, _pointer(code, number), row_of, valid, count, kind)
     code.do(f"br label %{done}")
     code.enter(done)
+    code.do("ret void")
+    if code.main is None:
+        return
+    code.begin("void @unpack_rows(ptr noalias %state, ptr noalias %rows, i64 %valid, ptr noalias %frame)")
+    for number, (place, count, kind) in zip(pointers, results, strict=True):
+        row_of = lambda lane: code.emit(f"load i64, ptr {code.entry('%rows', 'i64', lane)}")  # noqa: E731
+        _unpack_some(code, place, _pointer(code, number), row_of, "%valid", count, kind)
     code.do("ret void")
 
 
@@ -158,10 +186,10 @@ def _pack(code: VectorCode, source: str, lanes: list[str], count: int, kind: str
     return place
 
 
-def _unpack(code: VectorCode, place: str, target: str, lanes: list[str], count: int, kind: str) -> None:
+def _unpack(code: VectorCode, place: str, target: str, row: str, count: int, kind: str) -> None:
     """Vectors of a full block as rows of a result."""
     width, vector, unit = code.width, code.types[kind], code.units[kind]
-    first = code.emit(f"mul i64 {lanes[0]}, {count}")
+    first = code.emit(f"mul i64 {row}, {count}")
     start = code.emit(f"getelementptr {unit}, ptr {target}, i64 {first}")
     if count >= width:
 
@@ -209,13 +237,14 @@ def _masked(code: VectorCode, what: str, vector: str, arguments: str, result: st
     return name, f"{code.types['b']} <{flags}>"
 
 
-def _unpack_some(code: VectorCode, place: str, target: str, first: str, valid: str, count: int, kind: str) -> None:
-    """The same of the last block, whose last lanes are empty."""
+def _unpack_some(
+    code: VectorCode, place: str, target: str, row_of: Callable[[str], str], valid: str, count: int, kind: str
+) -> None:
+    """The first lanes as rows of a result, one by one."""
     unit = code.units[kind]
 
     def row(lane: str) -> None:
-        number = code.emit(f"add i64 {first}, {lane}")
-        begin = code.emit(f"mul i64 {number}, {count}")
+        begin = code.emit(f"mul i64 {row_of(lane)}, {count}")
 
         def one(entry: str) -> None:
             at = code.emit(f"mul i64 {entry}, {code.width}")

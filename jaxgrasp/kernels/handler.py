@@ -11,12 +11,15 @@ declare void @free(ptr)
 declare i32 @sched_yield()
 @DECLARATIONS@
 
-define internal void @block(ptr noalias %state, i64 %block) #0 {
-@BODY@
-}
+@FUNCTIONS@
+@BLOCK@
 
 define internal void @take(ptr %state) {
 entry:
+  %frame = alloca [@FRAME_BYTES@ x i8], align 64
+  %rest = alloca [@FRAME_BYTES@ x i8], align 64
+  %book = alloca [@BOOK@ x i64]
+  store i64 0, ptr %book
   %blocks.p = getelementptr i64, ptr %state, i64 1
   %next.p = getelementptr i64, ptr %state, i64 2
   %done.p = getelementptr i64, ptr %state, i64 3
@@ -25,6 +28,7 @@ entry:
   %chunk = load i64, ptr %chunk.p
   br label %more
 more:
+  %before = phi i64 [ 0, %entry ], [ %taken, %counted ]
   %from = atomicrmw add ptr %next.p, i64 %chunk monotonic
   %some = icmp ult i64 %from, %blocks
   br i1 %some, label %work, label %out
@@ -35,15 +39,17 @@ work:
   br label %one
 one:
   %number = phi i64 [ %from, %work ], [ %following, %one ]
-  call void @block(ptr %state, i64 %number)
+  call void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book)
   %following = add i64 %number, 1
   %again = icmp ult i64 %following, %to
   br i1 %again, label %one, label %counted
 counted:
   %share = sub i64 %to, %from
-  %before = atomicrmw add ptr %done.p, i64 %share release
+  %taken = add i64 %before, %share
   br label %more
 out:
+  call void @finish(ptr %state, ptr %rest, ptr %book)
+  %done = atomicrmw add ptr %done.p, i64 %before release
   ret void
 }
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-# Bytes of the stack that AVX-512's instructions reach from a pointer with one byte in place of four, and how many such
+# Bytes of a frame that AVX-512's instructions reach from a pointer with one byte in place of four, and how many such
 # pointers are kept. A kernel's loop is more code than a cache holds: reading it is what takes the time.
 _NEAR, _POINTERS = 1 << 14, 7
 
@@ -29,7 +29,9 @@ class Instructions:
         self.types = {"f": f"<{width} x {self.scalar}>", "i": f"<{width} x i32>", "b": f"<{width} x i1>", "u": "i64"}
         self.types["byte"] = f"<{width} x i8>"
         self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
+        self.functions: list[tuple[str, list[str]]] = []
         self.lines: list[str] = []
+        self.begun: Callable[[], None] = lambda: None
         self.offsets: dict[str, int] = {}
         self.used = 0
         self.declarations: set[str] = set()
@@ -58,7 +60,7 @@ class Instructions:
         self.block = block
 
     def allocate(self, kind: str, count: int = 1) -> str:
-        """Memory on the stack for vectors; its name is for `pointer`."""
+        """Memory in the frame for vectors; its name is for `pointer`."""
         self.count += 1
         name = f"%m{self.count}"
         size = count * (
@@ -68,18 +70,38 @@ class Instructions:
         self.used += -(-size // 64) * 64
         return name
 
-    def stack(self) -> list[str]:
-        """The code with which a function begins: the memory, and the pointers into it."""
-        lines = [f"%stack = alloca [{max(self.used, 64)} x i8], align 64"]
+    def stride(self, kind: str) -> int:
+        """Bytes from one vector of an array to the next."""
+        if kind == "b":
+            return -(-self.width // 8)
+        return self.width * (self.dtype.itemsize if kind == "f" else 4 if kind == "i" else 1)
+
+    def begin(self, signature: str) -> None:
+        """A new function; it has a pointer `%frame` to a block's memory."""
+        self.functions.append((signature, []))
+        self.lines, self.block = self.functions[-1][1], "entry"
+        self.begun()
+
+    def written(self) -> str:
+        """All functions."""
+        pointers = "\n".join(self._pointers())
+        return "\n".join(
+            f"define internal {signature} #0 {{\nentry:\n{pointers}\n" + "\n".join(lines) + "\n}\n"
+            for signature, lines in self.functions
+        )
+
+    def _pointers(self) -> list[str]:
+        """The code with which a function begins: pointers into the frame."""
+        lines = []
         for number in range(min(_POINTERS, -(-max(self.used, 1) // _NEAR))):
-            place = f"getelementptr i8, ptr %stack, i64 {number * _NEAR + _NEAR // 2}"
+            place = f"getelementptr i8, ptr %frame, i64 {number * _NEAR + _NEAR // 2}"
             # LLVM would count all of them from the same one if it knew.
             lines += [f"%near{number}.known = {place}"]
             lines += [f'%near{number} = call ptr asm "", "=r,0"(ptr %near{number}.known)']
         return lines
 
     def pointer(self, place: str) -> str:
-        """Address of memory on the stack; others' are returned as they are."""
+        """Address of memory in the frame; others' are returned as they are."""
         offset = self.offsets.get(place)
         if offset is None:
             return place

@@ -18,6 +18,12 @@ _INTEGER_CONDITIONS = {"eq": "eq", "ne": "ne", "lt": "slt", "le": "sle", "gt": "
 _INTRINSICS = {"sqrt": "sqrt", "exp": "exp", "log": "log", "floor": "floor", "abs": "fabs"}
 
 
+def main_loop(schedule: Schedule) -> Loop | None:
+    """The loop that goes on for as long as any problem's condition holds, if there is one that is in no other."""
+    loops = [e.subject for e in schedule.events if e.what == "test" and e.subject.body.depth == 1]
+    return loops[0] if len(loops) == 1 else None
+
+
 class VectorCode(Instructions):
     """Writes instructions.
 
@@ -31,6 +37,7 @@ class VectorCode(Instructions):
         """See the class."""
         super().__init__(dtype, width, estimates=estimates)
         self.own: list[str] = []
+        self.sizes: list[int] = []
         self.shared: list[str] = []
         self.fused: set[Value] = set()
         self.slots: dict[Loop | Guard, list[str]] = {}
@@ -40,6 +47,8 @@ class VectorCode(Instructions):
         self.carried: dict[Value, tuple[Loop, int]] = {}
         self.homes: set[Value] = set()
         self.narrowed: dict[tuple[str, Value], str] = {}
+        self.main: Loop | None = None
+        self.live: dict[int, str] = {}
 
     def operand(self, x: Any, kind: str) -> str:
         """The name or literal of a scalar."""
@@ -64,7 +73,7 @@ class VectorCode(Instructions):
             result: told the number and the name of every result.
             registers: vector registers for values.
         """
-        self.fused = schedule.fused
+        self.fused, self.main = schedule.fused, main_loop(schedule)
         self.registers = Registers(self, schedule, registers)
         for number, event in enumerate(schedule.events):
             if event.what == "compute":
@@ -73,7 +82,8 @@ class VectorCode(Instructions):
                 result(event.subject, self.registers.fetch(event.uses[0]) if event.uses else "")
             elif event.what == "test":
                 self.masks[event.subject] = self.operand(event.subject.condition, "b")
-                self.branch_if_any(self.masks[event.subject], event.subject)
+                least = "%few" if event.subject is self.main else "0"
+                self.branch_if_more(self.masks[event.subject], event.subject, least)
             elif isinstance(event.subject, Loop):
                 (self.enter_loop if event.what == "enter" else self.leave_loop)(event.subject, number)
             else:
@@ -121,6 +131,10 @@ class VectorCode(Instructions):
             if type(value) is Value and value.region is loop.body and not in_memory(value):
                 self.carried.setdefault(value, (loop, index))
         self.registers.flush(number)
+        if loop is self.main:
+            self.live = self.alive(number)
+            self.do("ret void")
+            self.begin("i64 @rounds(ptr noalias %state, ptr noalias %frame, i64 %few)")
         before, head = self.block, self.label("head")
         self.labels[loop] = (head, self.label("body"), self.label("after"))
         self.do(f"br label %{head}")
@@ -152,6 +166,9 @@ class VectorCode(Instructions):
             done = self.emit(f"icmp eq i64 {following}, {loop.rounds}")
             self.do(f"br i1 {done}, label %{after}, label %{head}")
         self.enter(after)
+        if loop is self.main:
+            self.do(f"ret i64 {self.unfinished}")
+            self.begin("void @after(ptr noalias %state, ptr noalias %frame)")
 
     def enter_guard(self, guard: Guard, number: int) -> None:
         """Code that is jumped over where no lane needs it; its results are zero then."""
@@ -161,7 +178,7 @@ class VectorCode(Instructions):
         mask = self.operand(guard.condition, "b")
         self.registers.flush(number)
         self.labels[guard] = ("", self.label("guarded"), self.label("after"))
-        self.branch_if_any(mask, guard)
+        self.branch_if_more(mask, guard, "0")
 
     def leave_guard(self, guard: Guard, number: int) -> None:
         """Its results go to their places."""
@@ -171,13 +188,43 @@ class VectorCode(Instructions):
         self.do(f"br label %{self.labels[guard][2]}")
         self.enter(self.labels[guard][2])
 
-    def branch_if_any(self, mask: str, step: Loop | Guard) -> None:
-        """Into the step where the mask holds for any lane, else past it."""
+    def branch_if_more(self, mask: str, step: Loop | Guard, least: str) -> None:
+        """Into the step where the mask holds for more than so many lanes, else past it."""
         bits = self.emit(f"bitcast {self.types['b']} {mask} to i{self.width}")
-        some = self.emit(f"icmp ne i{self.width} {bits}, 0")
+        self.unfinished = self.emit(f"zext i{self.width} {bits} to i64")
+        number = self.unfinished
+        if least != "0":
+            self.declare("declare i64 @llvm.ctpop.i64(i64)")
+            number = self.emit(f"call i64 @llvm.ctpop.i64(i64 {number})")
+        some = self.emit(f"icmp ugt i64 {number}, {least}")
         _, inside, after = self.labels[step]
         self.do(f"br i1 {some}, label %{inside}, label %{after}")
         self.enter(inside)
+
+    def alive(self, number: int) -> dict[int, str]:
+        """What a lane has in the frame where the main loop begins, event `number`: kinds by offset."""
+        found: dict[int, str] = {}
+
+        def add(place: str, kind: str, entry: int = 0) -> None:
+            found[self.offsets[place] + entry * self.stride(kind)] = kind
+
+        assert self.main is not None
+        for slot, kind in zip(self.slots[self.main], self.main.kinds, strict=True):
+            add(slot, kind)
+        for event in self.registers.schedule.events[number + 1 :]:
+            for value in event.uses:
+                if value.op == "own":
+                    argument, (entry, counter, _) = value.args
+                    entries = [entry] if counter is None else range(self.sizes[argument])
+                    for each in entries:
+                        add(self.own[argument], value.kind, each)
+                elif value.op == "result":
+                    step, index = value.args
+                    if step in self.slots:
+                        add(self.slots[step][index], value.kind)
+                elif value in self.registers.stored and not in_memory(value):
+                    add(self.registers.places[value], value.kind)
+        return found
 
     def store(self, kind: str, name: str, place: str) -> None:
         """Put a vector in memory."""

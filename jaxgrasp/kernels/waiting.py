@@ -1,0 +1,217 @@
+"""How a block of problems is solved: LLVM code around the functions that `cpu` writes.
+
+Some problems take longer than the others of their block. A vector of which few lanes still do something is not worth a
+round: these lanes go to a second frame, where they wait for those of later blocks until it is full. Nothing else of a
+lane changes, so its result does not depend on its company.
+
+What a thread keeps beside its two frames, its book, in words: how many lanes wait, the rows that these are of, and from
+where to where lanes are being moved.
+"""
+
+from jaxgrasp.kernels.vector_code import VectorCode
+
+_ALONE = """
+define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
+  call void @before(ptr %state, i64 %number, ptr %frame)
+  call void @unpack(ptr %state, i64 %number, ptr %frame)
+  ret void
+}
+
+define internal void @finish(ptr %state, ptr %rest, ptr %book) {
+  ret void
+}
+"""
+
+# A value of all lanes is a line of the cache: each is touched once.
+_MOVE = """
+define internal void @move.@TABLE@(ptr %a, ptr %b, ptr %sources, ptr %targets, i64 %lanes) {
+entry:
+  %count = load i64, ptr @@TABLE@.count
+  br label %more
+more:
+  %n = phi i64 [ 0, %entry ], [ %n.next, %moved ]
+  %some = icmp ult i64 %n, %count
+  br i1 %some, label %one, label %out
+one:
+  %place = getelementptr i32, ptr @@TABLE@, i64 %n
+  %short = load i32, ptr %place
+  %offset = zext i32 %short to i64
+  %from = getelementptr i8, ptr %a, i64 %offset
+  %to = getelementptr i8, ptr %b, i64 %offset
+  br label %each
+each:
+  %k = phi i64 [ 0, %one ], [ %k.next, %each ]
+  %source.p = getelementptr i64, ptr %sources, i64 %k
+  %target.p = getelementptr i64, ptr %targets, i64 %k
+  %source = load i64, ptr %source.p
+  %target = load i64, ptr %target.p
+@COPY@
+  %k.next = add i64 %k, 1
+  %again = icmp ult i64 %k.next, %lanes
+  br i1 %again, label %each, label %moved
+moved:
+  %n.next = add i64 %n, 1
+  br label %more
+out:
+  ret void
+}
+"""
+
+_COPY = """  %from.p = getelementptr @UNIT@, ptr %from, i64 %source
+  %to.p = getelementptr @UNIT@, ptr %to, i64 %target
+  %value = load @UNIT@, ptr %from.p
+  store @UNIT@ %value, ptr %to.p"""
+
+_COPY_BIT = """  %bits = load i@BITS@, ptr %from
+  %old = load i@BITS@, ptr %to
+  %down.by = trunc i64 %source to i@BITS@
+  %up.by = trunc i64 %target to i@BITS@
+  %down = lshr i@BITS@ %bits, %down.by
+  %bit = and i@BITS@ %down, 1
+  %up = shl i@BITS@ %bit, %up.by
+  %mark = shl i@BITS@ 1, %up.by
+  %others = xor i@BITS@ %mark, -1
+  %left = and i@BITS@ %old, %others
+  %new = or i@BITS@ %left, %up
+  store i@BITS@ %new, ptr %to"""
+
+_TOGETHER = """
+@TABLES@
+@MOVES@
+define internal void @move(ptr %a, ptr %b, ptr %book, i64 %lanes) {
+entry:
+  %sources = getelementptr i64, ptr %book, i64 @SOURCES@
+  %targets = getelementptr i64, ptr %book, i64 @TARGETS@
+  %none = icmp eq i64 %lanes, 0
+  br i1 %none, label %out, label %some
+some:
+  call void @move.words(ptr %a, ptr %b, ptr %sources, ptr %targets, i64 %lanes)
+  call void @move.longs(ptr %a, ptr %b, ptr %sources, ptr %targets, i64 %lanes)
+  call void @move.flags(ptr %a, ptr %b, ptr %sources, ptr %targets, i64 %lanes)
+  br label %out
+out:
+  ret void
+}
+
+declare i64 @llvm.cttz.i64(i64, i1)
+
+define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
+entry:
+  call void @before(ptr %state, i64 %number, ptr %frame)
+  %unfinished = call i64 @rounds(ptr %state, ptr %frame, i64 @FEW@)
+  %rows = load i64, ptr %state
+  %first = mul i64 %number, @WIDTH@
+  %waiting = load i64, ptr %book
+  %book.rows = getelementptr i64, ptr %book, i64 1
+  %book.sources = getelementptr i64, ptr %book, i64 @SOURCES@
+  %book.targets = getelementptr i64, ptr %book, i64 @TARGETS@
+  br label %more
+more:
+  %lanes = phi i64 [ %unfinished, %entry ], [ %others, %counted ]
+  %moved = phi i64 [ 0, %entry ], [ %moved.next, %counted ]
+  %some = icmp ne i64 %lanes, 0
+  br i1 %some, label %one, label %listed
+one:
+  %lane = call i64 @llvm.cttz.i64(i64 %lanes, i1 true)
+  %less = sub i64 %lanes, 1
+  %others = and i64 %lanes, %less
+  %row = add i64 %first, %lane
+  %target = add i64 %waiting, %moved
+  %row.p = getelementptr i64, ptr %book.rows, i64 %target
+  %source.p = getelementptr i64, ptr %book.sources, i64 %moved
+  %target.p = getelementptr i64, ptr %book.targets, i64 %moved
+  store i64 %row, ptr %row.p
+  store i64 %lane, ptr %source.p
+  store i64 %target, ptr %target.p
+  %real = icmp ult i64 %row, %rows
+  %one.more = zext i1 %real to i64
+  %moved.next = add i64 %moved, %one.more
+  br label %counted
+counted:
+  br label %more
+listed:
+  call void @move(ptr %frame, ptr %rest, ptr %book, i64 %moved)
+  %kept = add i64 %waiting, %moved
+  store i64 %kept, ptr %book
+  call void @after(ptr %state, ptr %frame)
+  call void @unpack(ptr %state, i64 %number, ptr %frame)
+  %full = icmp ugt i64 %kept, @ALMOST@
+  br i1 %full, label %complete, label %out
+complete:
+  call void @finish(ptr %state, ptr %rest, ptr %book)
+  br label %out
+out:
+  ret void
+}
+
+define internal void @finish(ptr %state, ptr %rest, ptr %book) {
+entry:
+  %book.rows = getelementptr i64, ptr %book, i64 1
+  %book.sources = getelementptr i64, ptr %book, i64 @SOURCES@
+  %book.targets = getelementptr i64, ptr %book, i64 @TARGETS@
+  %count = load i64, ptr %book
+  %none = icmp eq i64 %count, 0
+  br i1 %none, label %out, label %fill
+fill:
+  %lane = phi i64 [ %count, %entry ], [ %lane.next, %copy ]
+  %empty = phi i64 [ 0, %entry ], [ %empty.next, %copy ]
+  %more = icmp ult i64 %lane, @WIDTH@
+  br i1 %more, label %copy, label %run
+copy:
+  %source.p = getelementptr i64, ptr %book.sources, i64 %empty
+  %target.p = getelementptr i64, ptr %book.targets, i64 %empty
+  store i64 0, ptr %source.p
+  store i64 %lane, ptr %target.p
+  %lane.next = add i64 %lane, 1
+  %empty.next = add i64 %empty, 1
+  br label %fill
+run:
+  call void @move(ptr %rest, ptr %rest, ptr %book, i64 %empty)
+  %unfinished = call i64 @rounds(ptr %state, ptr %rest, i64 0)
+  call void @after(ptr %state, ptr %rest)
+  call void @unpack_rows(ptr %state, ptr %book.rows, i64 %count, ptr %rest)
+  store i64 0, ptr %book
+  br label %out
+out:
+  ret void
+}
+"""
+
+
+def blocks(code: VectorCode) -> str:
+    """The functions `block` and `finish` of a program that is written."""
+    if code.main is None:
+        return _ALONE
+    width, few = code.width, code.width // 4
+    values = {
+        "@MOVES@": _moves(width),
+        "@TABLES@": _tables(code),
+        "@FEW@": str(few),
+        "@ALMOST@": str(width - few),
+        "@SOURCES@": str(1 + width),
+        "@TARGETS@": str(1 + 2 * width),
+        "@WIDTH@": str(width),
+    }
+    text = _TOGETHER
+    for mark, value in values.items():
+        text = text.replace(mark, value)
+    return text
+
+
+def _moves(width: int) -> str:
+    """How a lane's data are copied to another one: numbers, integers and truth values."""
+    bits = _COPY_BIT.replace("@BITS@", str(max(8, width)))
+    copies = {"words": _COPY.replace("@UNIT@", "i32"), "longs": _COPY.replace("@UNIT@", "i64"), "flags": bits}
+    return "".join(_MOVE.replace("@COPY@", copy).replace("@TABLE@", name) for name, copy in copies.items())
+
+
+def _tables(code: VectorCode) -> str:
+    """Where a lane's data lie in a frame: offsets of numbers, of integers and of truth values."""
+    sizes = {"f": code.dtype.itemsize, "i": 4, "b": 0}
+    lines = []
+    for name, size in (("words", 4), ("longs", 8), ("flags", 0)):
+        offsets = sorted(offset for offset, kind in code.live.items() if sizes[kind] == size)
+        entries = ", ".join(f"i32 {offset}" for offset in offsets or [0])
+        lines.append(f"@{name} = internal constant [{max(1, len(offsets))} x i32] [{entries}]")
+        lines.append(f"@{name}.count = internal constant i64 {len(offsets)}")
+    return "\n".join(lines)
