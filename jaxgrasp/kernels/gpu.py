@@ -10,13 +10,14 @@ from typing import NamedTuple
 import jax
 
 from jaxgrasp.kernels import cuda, launcher, machine
-
 from jaxgrasp.kernels.expressions import Unsupported, Value, kind_of
 from jaxgrasp.kernels.lowering import Program
 from jaxgrasp.kernels.machine import Unavailable
 from jaxgrasp.kernels.schedule import scheduled
 from jaxgrasp.kernels.thread_code import ThreadCode
 
+# As XLA calls the devices.
+PLATFORM = "CUDA"
 TRIPLE = "nvptx64-nvidia-cuda"
 # Threads of a block: two warps, so that few problems are spread over many processors.
 THREADS = 64
@@ -24,7 +25,6 @@ THREADS = 64
 _NEWEST = 90
 # Pointers that a kernel takes; 4,096 bytes are the most.
 _MOST_POINTERS = 500
-
 
 
 class Devices(NamedTuple):
@@ -49,11 +49,11 @@ def devices() -> Devices:
     """
     try:
         found = jax.local_devices(backend="cuda")
-    except RuntimeError as error:
-        raise Unavailable(f"JAX has no GPU of NVIDIA's: {error}") from None
+        known = [int(device.compute_capability.replace(".", "")) for device in found]
+    except (RuntimeError, AttributeError) as error:
+        raise Unavailable(f"JAX knows no GPU of NVIDIA's: {error}") from None
     cuda.driver()
-    version = machine.machine().description.split()[0]
-    capability = min(_NEWEST, *[int(d.compute_capability.replace(".", "")) for d in found])
+    version, capability = machine.machine().description.split()[0], min(_NEWEST, *known)
     return Devices([d.local_hardware_id for d in found], capability, f"{version} {TRIPLE} sm_{capability}")
 
 
@@ -82,6 +82,15 @@ done:
   ret void
 }
 """
+
+
+def description() -> str:
+    """Everything about the GPUs at hand that compiled code depends on.
+
+    Raises:
+        Unavailable: there are no fused kernels for them.
+    """
+    return devices().description
 
 
 def module(program: Program, name: str) -> str:
@@ -164,19 +173,16 @@ def compiled(program: Program, name: str) -> bytes:
     return ptx(module(program, name), devices().capability).encode()
 
 
-def handler(code: bytes, name: str, arguments: int, results: int) -> int:
+def handler(code: bytes, name: str) -> int:
     """Address of the function by which XLA launches a kernel.
 
     Args:
         code: PTX.
         name: of the kernel, and of the function.
-        arguments: how many it takes.
-        results: how many it leaves.
 
     Raises:
         RuntimeError: the driver does not accept it.
     """
     kernel = cuda.kernel(code, name, devices().numbers)
-    launch = cuda.launch_address()
-    text = launcher.module(name, arguments, results, kernel=kernel, launch=launch, threads=THREADS)
+    text = launcher.module(name, kernel=kernel, launch=cuda.launch_address(), threads=THREADS)
     return machine.loaded(machine.compiled(text), name)

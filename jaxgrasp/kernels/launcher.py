@@ -2,8 +2,8 @@
 
 The offsets are those of xla/ffi/api/c_api.h, version 0.3. Where a structure is smaller than what is read from it, the
 handler does nothing at all: the caller finds its results untouched. Pointers need not be copied: the driver is given
-the places in XLA's buffers where they, and the number of rows, are. It launches where the stream is, whichever device
-that is. XLA is not told that calls may be recorded in its command buffers: the driver may still be loading the kernel.
+the places in XLA's structures where they, and the rows of the first result, are. It launches on the stream's device.
+XLA is not told that calls may be recorded in its command buffers: the driver may still be loading the kernel.
 """
 
 _HANDLER = """
@@ -68,8 +68,38 @@ refused:
   ret ptr %refusal
 launch:
   %stream = load ptr, ptr %stream.p
-  %parameters = alloca [@PARAMETERS@ x ptr]
-@FILL@
+  %count.p = getelementptr i8, ptr %frame, i64 56
+  %count = load i64, ptr %count.p
+  %left.p = getelementptr i8, ptr %frame, i64 96
+  %left = load i64, ptr %left.p
+  %both.count = add i64 %count, %left
+  %places = add i64 %both.count, 1
+  %parameters = alloca ptr, i64 %places
+  br label %argument
+argument:
+  %a = phi i64 [ 0, %launch ], [ %a.next, %argument ]
+  %a.p = getelementptr ptr, ptr %arguments, i64 %a
+  %a.buffer = load ptr, ptr %a.p
+  %a.data = getelementptr i8, ptr %a.buffer, i64 24
+  %a.slot = getelementptr ptr, ptr %parameters, i64 %a
+  store ptr %a.data, ptr %a.slot
+  %a.next = add i64 %a, 1
+  %a.more = icmp ult i64 %a.next, %count
+  br i1 %a.more, label %argument, label %result
+result:
+  %r = phi i64 [ 0, %argument ], [ %r.next, %result ]
+  %r.p = getelementptr ptr, ptr %results, i64 %r
+  %r.buffer = load ptr, ptr %r.p
+  %r.data = getelementptr i8, ptr %r.buffer, i64 24
+  %r.place = add i64 %count, %r
+  %r.slot = getelementptr ptr, ptr %parameters, i64 %r.place
+  store ptr %r.data, ptr %r.slot
+  %r.next = add i64 %r, 1
+  %r.more = icmp ult i64 %r.next, %left
+  br i1 %r.more, label %result, label %go
+go:
+  %last = getelementptr ptr, ptr %parameters, i64 %both.count
+  store ptr %rows.p, ptr %last
   %padded = add i64 %rows, @BEYOND@
   %blocks.wide = udiv i64 %padded, @THREADS@
   %blocks = trunc i64 %blocks.wide to i32
@@ -98,45 +128,25 @@ failed:
 _SAID = "jaxgrasp: the GPU's driver does not launch a kernel, CUDA error %d"
 
 
-def module(name: str, arguments: int, results: int, *, kernel: int, launch: int, threads: int) -> str:
-    """LLVM code of the handler `name`.
+def module(name: str, *, kernel: int, launch: int, threads: int) -> str:
+    """LLVM code of the handler `name`, for a kernel of all arguments and results of a call and the number of rows.
 
     Args:
         name: of the handler.
-        arguments: how many the kernel takes.
-        results: how many it leaves, at least one, each with the rows as its first axis.
         kernel: the driver's handle.
         launch: address of `cuLaunchKernel`.
         threads: of a block.
     """
-    said = _SAID + "\\00"
     values = {
         "@NAME@": f"@{name}",
-        "@FILL@": "\n".join(_fill(arguments, results)),
-        "@PARAMETERS@": str(arguments + results + 1),
         "@BEYOND@": str(threads - 1),
         "@THREADS@": str(threads),
         "@LAUNCH@": str(launch),
         "@KERNEL@": str(kernel),
-        "@SAID@": said,
+        "@SAID@": _SAID + "\\00",
         "@LENGTH@": str(len(_SAID) + 1),
     }
     text = _HANDLER
     for mark, value in values.items():
         text = text.replace(mark, value)
     return text
-
-
-def _fill(arguments: int, results: int) -> list[str]:
-    """Where the kernel's parameters are: a buffer's pointer is 24 bytes from where the buffer is."""
-    lines = []
-    for number in range(arguments + results):
-        array, index = ("%arguments", number) if number < arguments else ("%results", number - arguments)
-        lines += [
-            f"  %buffer{number} = call ptr @field(ptr {array}, i64 {8 * index})",
-            f"  %data{number} = getelementptr i8, ptr %buffer{number}, i64 24",
-            f"  %slot{number} = getelementptr ptr, ptr %parameters, i64 {number}",
-            f"  store ptr %data{number}, ptr %slot{number}",
-        ]
-    last = arguments + results
-    return [*lines, f"  %slot = getelementptr ptr, ptr %parameters, i64 {last}", "  store ptr %rows.p, ptr %slot"]
