@@ -1,17 +1,22 @@
-"""A GPU's kernels on the host: the same code, thread after thread."""
+"""A GPU on the host: the same kernels, thread after thread, launched by the same handler that XLA calls."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+from collections.abc import Iterator
+from functools import cache, partial
+from pathlib import Path
 
 import jax
-import numpy as np
+import pytest
 
-from jaxgrasp.fence import loops
-from jaxgrasp.kernels import fingerprint, gpu, machine
-from jaxgrasp.kernels.lowering import Program, lowered
+from jaxgrasp.kernels import cuda, gpu, launcher, machine, native
+from jaxgrasp.solvers import lanes
 
 SPECIAL = "@llvm.nvvm.read.ptx.sreg."
+# The numbers of a thread: its block, the threads of a block, its number in it.
+REGISTERS = ("ctaid", "ntid", "tid")
 GRID = """
 @at = internal global [3 x i32] zeroinitializer
 @READ@
@@ -40,61 +45,151 @@ out:
   ret void
 }
 """
+# `cuLaunchKernel`, to which a kernel's handle is the address of its grid.
+LAUNCH = """
+define i32 @launch(ptr %f, i32 %x, i32 %y, i32 %z, i32 %t, i32 %ty, i32 %tz, i32 %b, ptr %s, ptr %parameters, ptr %e) {
+  call void %f(i32 %x, i32 %t, ptr %parameters)
+  ret i32 0
+}
+"""
 
 
-class Emulated:
-    """A program's kernel, as code of the host."""
+def kernel(code: bytes, name: str, devices: list[int]) -> int:
+    """In place of the driver's: the address of a function that runs a kernel for all threads of a grid.
 
-    def __init__(self, program: Program) -> None:
-        self.program = program
-        text = gpu.module(program, "kernel").replace("ptx_kernel ", "").replace("addrspace(1) ", "")
-        lines = [line for line in text.splitlines() if not line.startswith(("target", f"declare i32 {SPECIAL}"))]
-        count = len(program.inputs) + len(program.outputs)
-        call = []
-        for number in range(count + 1):
-            kind = "i64" if number == count else "ptr"
-            call += [
-                f"  %p{number} = getelementptr ptr, ptr %parameters, i64 {number}",
-                f"  %at{number} = load ptr, ptr %p{number}",
-                f"  %x{number} = load {kind}, ptr %at{number}",
-            ]
-        given = ", ".join(f"ptr %x{number}" for number in range(count))
-        call.append(f"  call void @kernel({given}, i64 %x{count})")
-        read = "".join(
-            f"define internal i32 @special.{name}.x() {{\n  %p = getelementptr i32, ptr @at, i64 {index}\n"
-            "  %v = load i32, ptr %p\n  ret i32 %v\n}\n"
-            for index, name in enumerate(("ctaid", "ntid", "tid"))
-        )
-        text = "\n".join(lines).replace(SPECIAL, "@special.")
-        grid = GRID.replace("@READ@", read).replace("@CALL@", "\n".join(call))
-        address = machine.loaded(machine.compiled(text + grid), "grid")
-        self.launch = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_uint, ctypes.c_void_p)(address)
-
-    def __call__(self, *arguments: np.ndarray, threads: int = gpu.THREADS) -> list[np.ndarray]:
-        """Results for batch-first arguments; those that are shared have no batch."""
-        rows = next(len(x) for x, shared in zip(arguments, self.program.shared, strict=True) if not shared)
-        given = [np.ascontiguousarray(x) for x in arguments]
-        results = [np.empty((rows, *shape[:-1]), dtype) for shape, dtype in self.program.out_avals]
-        parameters = [*[ctypes.c_void_p(x.ctypes.data) for x in (*given, *results)], ctypes.c_int64(rows)]
-        places = [ctypes.addressof(x) for x in parameters]
-        self.launch(-(-rows // threads), threads, (ctypes.c_void_p * len(places))(*places))
-        return results
+    Args:
+        code: LLVM's text of the kernel for a GPU.
+        name: of the kernel.
+        devices: of no meaning here.
+    """
+    text = code.decode().replace("ptx_kernel ", "").replace("addrspace(1) ", "")
+    lines = [line for line in text.splitlines() if not line.startswith(("target", f"declare i32 {SPECIAL}"))]
+    (head,) = [line for line in lines if line.startswith("define")]
+    kinds = [part.split()[0] for part in head[head.index("(") + 1 : head.rindex(")")].split(",")]
+    call = []
+    for number, kind in enumerate(kinds):
+        call += [
+            f"  %p{number} = getelementptr ptr, ptr %parameters, i64 {number}",
+            f"  %at{number} = load ptr, ptr %p{number}",
+            f"  %x{number} = load {kind}, ptr %at{number}",
+        ]
+    call.append(f"  call void @{name}({', '.join(f'{kind} %x{number}' for number, kind in enumerate(kinds))})")
+    read = "".join(
+        f"define internal i32 @special.{special}.x() {{\n  %p = getelementptr i32, ptr @at, i64 {index}\n"
+        "  %v = load i32, ptr %p\n  ret i32 %v\n}\n"
+        for index, special in enumerate(REGISTERS)
+    )
+    grid = GRID.replace("@READ@", read).replace("@CALL@", "\n".join(call))
+    return machine.loaded(machine.compiled("\n".join(lines).replace(SPECIAL, "@special.") + grid), "grid")
 
 
-_kernels: dict[str, Emulated] = {}
+@cache
+def launch_address() -> int:
+    """In place of the driver's."""
+    return machine.loaded(machine.compiled(LAUNCH), "launch")
 
 
-def fused(function, leaves, shared, otherwise, known_as=None):
-    """In place of `kernels.fused`: every kernel is emulated."""
-    problems = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
-    events = [x.shape if s else x.shape[1:] for x, s in zip(leaves, shared, strict=True)]
-    given = [jax.ShapeDtypeStruct((*e, 1), x.dtype) for e, x in zip(events, leaves, strict=True)]
-    with loops():
-        jaxpr, out = jax.make_jaxpr(function, return_shape=True)(given)
-    key = fingerprint.of_program(jaxpr, shared, "emulated")
-    if key not in _kernels:
-        _kernels[key] = Emulated(lowered(jaxpr, list(shared)))
-    wanted, structure = jax.tree.flatten(out)
-    shapes = [jax.ShapeDtypeStruct((problems, *x.shape[:-1]), x.dtype) for x in wanted]
-    found = jax.pure_callback(lambda *parts: _kernels[key](*map(np.asarray, parts)), shapes, *leaves)
-    return jax.tree.unflatten(structure, found)
+@contextlib.contextmanager
+def in_place(folder: Path) -> Iterator[None]:
+    """Inside, what is for CPUs runs as on a GPU: all but the driver, the assembler and the stream is as it is there.
+
+    Args:
+        folder: where kernels are kept.
+    """
+    asks = "call ptr %stream.f(ptr %question)"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        patch.setattr(gpu, "PLATFORM", "cpu")
+        patch.setattr(gpu, "devices", lambda: gpu.Devices([0], 80, "emulated"))
+        patch.setattr(gpu, "ptx", lambda code, capability: code)
+        patch.setattr(cuda, "kernel", kernel)
+        patch.setattr(cuda, "launch_address", launch_address)
+        assert asks in launcher._HANDLER
+        patch.setattr(launcher, "_HANDLER", launcher._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
+        patch.setattr(native, "usable", lambda platform: native._allowed.get() and native._works(platform))
+        patch.setattr(lanes, "fused", partial(native.fused, platform="cuda"))
+        jax.clear_caches()
+        yield
+    native._works.cache_clear()
+    jax.clear_caches()
+
+
+# What XLA hands to a handler, see xla/ffi/api/c_api.h.
+
+
+class Buffer(ctypes.Structure):
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("dtype", ctypes.c_int),
+        ("data", ctypes.c_void_p),
+        ("rank", ctypes.c_int64),
+        ("dims", ctypes.POINTER(ctypes.c_int64)),
+    ]
+
+
+class Buffers(ctypes.Structure):
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("size", ctypes.c_int64),
+        ("types", ctypes.c_void_p),
+        ("buffers", ctypes.POINTER(ctypes.POINTER(Buffer))),
+    ]
+
+
+class Version(ctypes.Structure):
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("major", ctypes.c_int),
+        ("minor", ctypes.c_int),
+    ]
+
+
+class Api(ctypes.Structure):
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("version", Version),
+        ("internal", ctypes.c_void_p),
+        ("error_create", ctypes.c_void_p),
+        ("error_get_message", ctypes.c_void_p),
+        ("error_destroy", ctypes.c_void_p),
+        ("handler_register", ctypes.c_void_p),
+        ("stream_get", ctypes.c_void_p),
+    ]
+
+
+class Frame(ctypes.Structure):
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("api", ctypes.POINTER(Api)),
+        ("context", ctypes.c_void_p),
+        ("stage", ctypes.c_int),
+        ("arguments", Buffers),
+        ("results", Buffers),
+    ]
+
+
+class Question(ctypes.Structure):
+    """Of XLA_FFI_Stream_Get and, by other names, XLA_FFI_Error_Create."""
+
+    _fields_ = [
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("context", ctypes.c_void_p),
+        ("stream", ctypes.c_void_p),
+    ]
+
+
+def buffers(*places: tuple[int, tuple[int, ...]]) -> Buffers:
+    """Of arrays at some addresses, with shapes."""
+    made = [
+        Buffer(ctypes.sizeof(Buffer), None, 12, at, len(shape), (ctypes.c_int64 * len(shape))(*shape))
+        for at, shape in places
+    ]
+    return Buffers(
+        ctypes.sizeof(Buffers), None, len(made), None, (ctypes.POINTER(Buffer) * len(made))(*map(ctypes.pointer, made))
+    )

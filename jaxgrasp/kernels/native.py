@@ -179,7 +179,7 @@ def _works(platform: str) -> bool:
         with _lock:
             name = target(_planned(lambda x: x[0] + 1, one, (False,), None, platform))
         with jax.ensure_compile_time_eval():
-            given = jax.device_put(start, jax.local_devices(backend=platform)[0])
+            given = jax.device_put(start, jax.local_devices(backend=_MAKERS[platform].PLATFORM.lower())[0])
             out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(given)
         if not np.array_equal(np.asarray(out), start + 1):
             raise Unavailable("this version of XLA hands arrays over in another way")
