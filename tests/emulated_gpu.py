@@ -53,6 +53,9 @@ define i32 @launch(ptr %f, i32 %x, i32 %y, i32 %z, i32 %t, i32 %ty, i32 %tz, i32
 }
 """
 
+# LLVM's texts of all kernels that were emulated.
+codes: list[str] = []
+
 
 def kernel(code: bytes, name: str, devices: list[int]) -> int:
     """In place of the driver's: the address of a function that runs a kernel for all threads of a grid.
@@ -62,7 +65,8 @@ def kernel(code: bytes, name: str, devices: list[int]) -> int:
         name: of the kernel.
         devices: of no meaning here.
     """
-    text = code.decode().replace("ptx_kernel ", "").replace("addrspace(1) ", "")
+    codes.append(code.decode())
+    text = codes[-1].replace("ptx_kernel ", "").replace("addrspace(1) ", "")
     lines = [line for line in text.splitlines() if not line.startswith(("target", f"declare i32 {SPECIAL}"))]
     (head,) = [line for line in lines if line.startswith("define")]
     kinds = [part.split()[0] for part in head[head.index("(") + 1 : head.rindex(")")].split(",")]
@@ -184,12 +188,11 @@ class Question(ctypes.Structure):
     ]
 
 
-def buffers(*places: tuple[int, tuple[int, ...]]) -> Buffers:
-    """Of arrays at some addresses, with shapes."""
+def buffers(*shapes: tuple[int, ...]) -> Buffers:
+    """Of arrays with these shapes, the first at address 1000, the second at 2000, and so on."""
     made = [
-        Buffer(ctypes.sizeof(Buffer), None, 12, at, len(shape), (ctypes.c_int64 * len(shape))(*shape))
-        for at, shape in places
+        Buffer(ctypes.sizeof(Buffer), None, 12, 1000 * number, len(shape), (ctypes.c_int64 * len(shape))(*shape))
+        for number, shape in enumerate(shapes, 1)
     ]
-    return Buffers(
-        ctypes.sizeof(Buffers), None, len(made), None, (ctypes.POINTER(Buffer) * len(made))(*map(ctypes.pointer, made))
-    )
+    pointers = (ctypes.POINTER(Buffer) * len(made))(*map(ctypes.pointer, made))
+    return Buffers(ctypes.sizeof(Buffers), None, len(made), None, pointers)

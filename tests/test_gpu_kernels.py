@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 import shutil
 import subprocess
-import sys
-import warnings
-from functools import partial
+import tempfile
+from functools import cache, partial
+from pathlib import Path
 
 import emulated_gpu
 import harness
@@ -19,9 +18,8 @@ import problems
 import pytest
 from jax import lax
 
-import jaxgrasp as jg
 from jaxgrasp import kernels
-from jaxgrasp.kernels import cuda, gpu, launcher, lowering, machine, native
+from jaxgrasp.kernels import gpu, lowering, native
 from jaxgrasp.kernels.expressions import Unsupported
 
 SAME_MARGIN = {"float64": 2e-8, "float32": 1e-4}
@@ -33,10 +31,10 @@ ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 CAPABILITIES = (80, 90)
 
 
-@pytest.fixture(scope="module")
-def emulated(tmp_path_factory):
+@pytest.fixture
+def emulated(tmp_path):
     """Kernels for GPUs in place of those for CPUs."""
-    with emulated_gpu.in_place(tmp_path_factory.mktemp("kernels")):
+    with emulated_gpu.in_place(tmp_path):
         assert native.usable("cuda")
         yield
 
@@ -132,7 +130,7 @@ def test_blocks_that_are_full_and_that_are_not(emulated, count):
 
 
 def some_grasps(dtype="float64"):
-    """Of every family, also with contacts that are absent; three of them with data that are no numbers, or too small."""
+    """Of every family, also with contacts that are absent; three with data that are no numbers, or too small."""
     batch = problems.group("4 contacts").batch
     batch = batch[np.linspace(0, len(batch) - 1, 3 * gpu.THREADS + 8).astype(int)]
     contacts, *others = harness.data_of(batch, jnp.dtype(dtype))
@@ -159,14 +157,19 @@ def assert_same_margins(ours, theirs, dtype):
     assert (np.abs(ours.margin - theirs.margin)[known] <= SAME_MARGIN[dtype] * unit).all()
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
-def margins(emulated, request):
-    dtype, data = request.param, some_grasps(request.param)
-    return dtype, harness.as_numpy(harness.largest(*data)), on_xla(harness.largest, *data)
+@cache
+def margins(dtype: str):
+    """Answers of kernels and of XLA, and the code of the kernel."""
+    data = some_grasps(dtype)
+    with tempfile.TemporaryDirectory() as folder, emulated_gpu.in_place(Path(folder)):
+        ours = harness.as_numpy(harness.largest(*data))
+        code = emulated_gpu.codes[-1]
+    return ours, on_xla(harness.largest, *data), code
 
 
-def test_the_same_margins_as_on_xla(margins):
-    dtype, ours, theirs = margins
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_the_same_margins_as_on_xla(dtype):
+    ours, theirs, _ = margins(dtype)
     assert_same_margins(ours, theirs, dtype)
 
 
@@ -190,3 +193,66 @@ def test_the_same_gradients(emulated):
     ours, theirs = np.asarray(gradient(data[0].positions, *data)), on_xla(gradient, data[0].positions, *data)
     np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-7)
     assert (ours != 0).any((1, 2)).mean() > 0.5
+
+
+# PTX
+
+
+@cache
+def ptx(dtype: str, capability: int) -> str:
+    return gpu.ptx(margins(dtype)[2], capability)
+
+
+@pytest.mark.parametrize("capability", CAPABILITIES)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_ptx_rounds_as_it_should(dtype, capability):
+    text, kind = ptx(dtype, capability), "f64" if dtype == "float64" else "f32"
+    assert f".target sm_{capability}" in text
+    assert len(re.findall(r"\.visible \.entry jaxgrasp_", text)) == 1
+    for instruction in ("fma", "rcp", "sqrt"):
+        assert f"{instruction}.rn.{kind}" in text
+    # Sums and products without .rn could become one instruction, rounded once.
+    for wrong in (r"\bcall", r"\.extern", r"\.ftz", r"\.approx", r"\.full", r"\b(add|sub|mul|div)\.f\d", r"\.local"):
+        assert not re.search(wrong, text), wrong
+
+
+@pytest.mark.parametrize("capability", CAPABILITIES)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_ptx_assembles(dtype, capability, tmp_path):
+    """Without a frame on the stack of more than what a thread of a GPU can have at all."""
+    assembler = shutil.which("ptxas")
+    if assembler is None:
+        pytest.skip("no ptxas on the path")
+    (tmp_path / "kernel.ptx").write_text(text)
+    given = [
+        assembler,
+        "-v",
+        f"-arch=sm_{capability}",
+        "-o",
+        str(tmp_path / "kernel.cubin"),
+        str(tmp_path / "kernel.ptx"),
+    ]
+    done = subprocess.run(given, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert int(re.search(r"Used (\d+) registers", done.stderr)[1]) <= 255
+    assert int(re.search(r"(\d+) bytes stack frame", done.stderr)[1]) < 16_384
+
+
+def program_of(function, *shapes, dtype="float64"):
+    given = [jax.ShapeDtypeStruct((*shape, 1), dtype) for shape in shapes]
+    return lowering.lowered(jax.make_jaxpr(function)(*given), [False] * len(given))
+
+
+@pytest.mark.parametrize("function", [jnp.exp, jnp.log])
+def test_functions_that_gpus_have_no_instructions_for_are_left_to_xla(function):
+    with pytest.raises(Unsupported, match="on a GPU"):
+        gpu.module(program_of(function, (3,)), "kernel")
+
+
+def test_operations_without_results_are_left_to_xla():
+    def told(x):
+        jax.debug.callback(lambda: None)
+        return x * 2
+
+    with pytest.raises(Unsupported, match="debug_callback, which has no result"):
+        program_of(told, (3,))
