@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 from collections.abc import Iterator
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -93,6 +93,16 @@ def launch_address() -> int:
     return machine.loaded(machine.compiled(LAUNCH), "launch")
 
 
+def fused(function, leaves, shared, otherwise, known_as=None):
+    """In place of `kernels.fused`: for a GPU, and left to XLA only inside `kernels.without`."""
+    otherwise = no_kernel if native._allowed.get() else otherwise
+    return native.fused(function, leaves, shared, otherwise, known_as, "cuda")
+
+
+def no_kernel(leaves):
+    raise AssertionError("no fused kernel")
+
+
 @contextlib.contextmanager
 def in_place(folder: Path) -> Iterator[None]:
     """Inside, what is for CPUs runs as on a GPU: all but the driver, the assembler and the stream is as it is there.
@@ -111,7 +121,7 @@ def in_place(folder: Path) -> Iterator[None]:
         assert asks in launcher._HANDLER
         patch.setattr(launcher, "_HANDLER", launcher._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
         patch.setattr(native, "usable", lambda platform: native._allowed.get() and native._works(platform))
-        patch.setattr(lanes, "fused", partial(native.fused, platform="cuda"))
+        patch.setattr(lanes, "fused", fused)
         jax.clear_caches()
         yield
     native._works.cache_clear()

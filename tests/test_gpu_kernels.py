@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
+import sys
 import tempfile
 from functools import cache, partial
 from pathlib import Path
@@ -18,7 +17,9 @@ import problems
 import pytest
 from jax import lax
 
-from jaxgrasp import kernels
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import gpu_kernels  # noqa: E402
+from jaxgrasp import kernels  # noqa: E402
 from jaxgrasp.kernels import gpu, lowering, native
 from jaxgrasp.kernels.expressions import Unsupported
 
@@ -39,14 +40,10 @@ def emulated(tmp_path):
         yield
 
 
-def no_kernel(leaves):
-    raise AssertionError("no fused kernel")
-
-
 def assert_same(function, *leaves, shared=None):
     """A function of one problem over the leading axis, fused and by XLA; the lane axis trails inside."""
     shared = shared or (False,) * len(leaves)
-    ours = native.fused(lambda parts: function(*parts), list(leaves), shared, no_kernel, platform="cuda")
+    ours = native.fused(lambda parts: function(*parts), list(leaves), shared, emulated_gpu.no_kernel, platform="cuda")
     one = lambda *parts: jax.tree.map(lambda x: x[..., 0], function(*[x[..., None] for x in parts]))  # noqa: E731
     theirs = jax.vmap(one, [None if s else 0 for s in shared])(*leaves)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
@@ -218,24 +215,13 @@ def test_ptx_rounds_as_it_should(dtype, capability):
 
 @pytest.mark.parametrize("capability", CAPABILITIES)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_ptx_assembles(dtype, capability, tmp_path):
-    """Without a frame on the stack of more than what a thread of a GPU can have at all."""
-    assembler = shutil.which("ptxas")
-    if assembler is None:
-        pytest.skip("no ptxas on the path")
-    (tmp_path / "kernel.ptx").write_text(text)
-    given = [
-        assembler,
-        "-v",
-        f"-arch=sm_{capability}",
-        "-o",
-        str(tmp_path / "kernel.cubin"),
-        str(tmp_path / "kernel.ptx"),
-    ]
-    done = subprocess.run(given, capture_output=True, text=True, timeout=200)
-    assert done.returncode == 0, done.stderr
-    assert int(re.search(r"Used (\d+) registers", done.stderr)[1]) <= 255
-    assert int(re.search(r"(\d+) bytes stack frame", done.stderr)[1]) < 16_384
+def test_ptx_assembles(dtype, capability):
+    """For all of a thread's registers, and a stack that thousands of threads can have."""
+    if gpu_kernels.assembler() is None:
+        pytest.skip("no ptxas")
+    made = gpu_kernels.assembled(ptx(dtype, capability), capability)
+    assert 32 < made.registers <= 255
+    assert made.stack < 16_384
 
 
 def program_of(function, *shapes, dtype="float64"):
