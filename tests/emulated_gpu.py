@@ -1,4 +1,7 @@
-"""A GPU on the host: the same kernels, thread after thread, launched by the same handler that XLA calls."""
+"""A GPU on the host: the same kernels, thread after thread, launched by the same handler that XLA calls.
+
+Where there is a GPU, it takes its place.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,7 @@ define i32 @launch(ptr %f, i32 %x, i32 %y, i32 %z, i32 %t, i32 %ty, i32 %tz, i32
 }
 """
 
-# LLVM's texts of all kernels that were emulated.
+# LLVM's texts of all kernels that were made in `in_place`.
 codes: list[str] = []
 
 
@@ -65,8 +68,7 @@ def kernel(code: bytes, name: str, devices: list[int]) -> int:
         name: of the kernel.
         devices: of no meaning here.
     """
-    codes.append(code.decode())
-    text = codes[-1].replace("ptx_kernel ", "").replace("addrspace(1) ", "")
+    text = code.decode().replace("ptx_kernel ", "").replace("addrspace(1) ", "")
     lines = [line for line in text.splitlines() if not line.startswith(("target", f"declare i32 {SPECIAL}"))]
     (head,) = [line for line in lines if line.startswith("define")]
     kinds = [part.split()[0] for part in head[head.index("(") + 1 : head.rindex(")")].split(",")]
@@ -93,39 +95,55 @@ def launch_address() -> int:
     return machine.loaded(machine.compiled(LAUNCH), "launch")
 
 
-def fused(function, leaves, shared, otherwise, known_as=None):
-    """In place of `kernels.fused`: for a GPU, and left to XLA only inside `kernels.without`."""
-    otherwise = no_kernel if native._allowed.get() else otherwise
-    return native.fused(function, leaves, shared, otherwise, known_as, "cuda")
-
-
 def no_kernel(leaves):
     raise AssertionError("no fused kernel")
 
 
 @contextlib.contextmanager
 def in_place(folder: Path) -> Iterator[None]:
-    """Inside, what is for CPUs runs as on a GPU: all but the driver, the assembler and the stream is as it is there.
+    """Inside, kernels run on the GPU where there is one, else as on one, and what cannot become a kernel is an error.
+
+    Without a GPU all but the driver, the assembler and the stream are what they are with one.
 
     Args:
         folder: where kernels are kept.
     """
-    asks = "call ptr %stream.f(ptr %question)"
+    there = jax.default_backend() == "gpu"
+
+    def fused(function, leaves, shared, otherwise, known_as=None, platform="cpu" if there else "cuda"):
+        wanted = platform == "cuda" and native._allowed.get()
+        return native.fused(function, leaves, shared, no_kernel if wanted else otherwise, known_as, platform)
+
+    def module(program, name, write=gpu.module):
+        codes.append(write(program, name))
+        return codes[-1]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        patch.setattr(gpu, "PLATFORM", "cpu")
-        patch.setattr(gpu, "devices", lambda: gpu.Devices([0], 80, "emulated"))
-        patch.setattr(gpu, "ptx", lambda code, capability: code)
-        patch.setattr(cuda, "kernel", kernel)
-        patch.setattr(cuda, "launch_address", launch_address)
-        assert asks in launcher._HANDLER
-        patch.setattr(launcher, "_HANDLER", launcher._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
-        patch.setattr(native, "usable", lambda platform: native._allowed.get() and native._works(platform))
+        patch.setenv(native.SETTING, "fused")
+        patch.setattr(gpu, "module", module)
         patch.setattr(lanes, "fused", fused)
+        if not there:
+            emulate(patch)
         jax.clear_caches()
+        assert native.usable("cuda")
         yield
-    native._works.cache_clear()
+    if not there:
+        native._works.cache_clear()
     jax.clear_caches()
+
+
+def emulate(patch: pytest.MonkeyPatch) -> None:
+    """What is for GPUs runs on CPUs."""
+    asks = "call ptr %stream.f(ptr %question)"
+    patch.setattr(gpu, "PLATFORM", "cpu")
+    patch.setattr(gpu, "devices", lambda: gpu.Devices([0], 80, "emulated"))
+    patch.setattr(gpu, "ptx", lambda code, capability: code)
+    patch.setattr(cuda, "kernel", kernel)
+    patch.setattr(cuda, "launch_address", launch_address)
+    assert asks in launcher._HANDLER
+    patch.setattr(launcher, "_HANDLER", launcher._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
+    patch.setattr(native, "usable", lambda platform: native._allowed.get() and native._works(platform))
 
 
 # What XLA hands to a handler, see xla/ffi/api/c_api.h.

@@ -1,7 +1,8 @@
-"""Kernels for GPUs: on the host, as PTX, and what launches them; on a GPU where there is one."""
+"""Kernels for GPUs against XLA: on the GPU where there is one, else emulated on the host; and the PTX that they are."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import sys
 import tempfile
@@ -18,6 +19,7 @@ import pytest
 from jax import lax
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import jaxgrasp as jg  # noqa: E402
 from benchmarks import gpu_kernels  # noqa: E402
 from jaxgrasp import kernels  # noqa: E402
 from jaxgrasp.kernels import gpu, lowering, native
@@ -34,9 +36,8 @@ CAPABILITIES = (80, 90)
 
 @pytest.fixture
 def emulated(tmp_path):
-    """Kernels for GPUs in place of those for CPUs."""
+    """Kernels for GPUs in place of others."""
     with emulated_gpu.in_place(tmp_path):
-        assert native.usable("cuda")
         yield
 
 
@@ -53,9 +54,6 @@ def assert_same(function, *leaves, shared=None):
 
 def rows(count: int, *event: int, dtype="float64", seed=0) -> jax.Array:
     return jnp.asarray(np.random.default_rng(seed).normal(size=(count, *event)), dtype)
-
-
-# The same code on the host
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -176,20 +174,22 @@ def test_the_same_least_efforts(emulated):
     least = partial(harness.least, cone_edges=4)
     ours, theirs = harness.as_numpy(least(*data, margin)), on_xla(least, *data, margin)
     np.testing.assert_array_equal(ours.status, theirs.status)
+    assert (ours.status == jg.Status.SOLVED).mean() > 0.5
     np.testing.assert_allclose(ours.effort, theirs.effort, rtol=1e-6, atol=1e-9)
 
 
 def total(positions, contacts, disturbances, load, reserve):
-    moved = jax.tree.map(lambda x: positions if x is contacts.positions else x, contacts)
+    moved = dataclasses.replace(contacts, positions=positions)
     return harness.largest(moved, disturbances, load, reserve, cone_edges=4).margin.sum()
 
 
 def test_the_same_gradients(emulated):
-    data = some_grasps()
-    gradient = jax.jit(jax.grad(total))
+    """Inside jit, grad and vmap over batches."""
+    data = jax.tree.map(lambda x: x.reshape(2, -1, *x.shape[1:]), some_grasps())
+    gradient = jax.jit(jax.grad(lambda *args: jax.vmap(total)(*args).sum()))
     ours, theirs = np.asarray(gradient(data[0].positions, *data)), on_xla(gradient, data[0].positions, *data)
     np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-7)
-    assert (ours != 0).any((1, 2)).mean() > 0.5
+    assert (ours != 0).any((2, 3)).mean() > 0.5
 
 
 # PTX
@@ -213,8 +213,7 @@ def test_ptx_rounds_as_it_should(dtype, capability):
         assert not re.search(wrong, text), wrong
 
 
-@pytest.mark.parametrize("capability", CAPABILITIES)
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(("dtype", "capability"), [("float64", 90), ("float32", 80)])
 def test_ptx_assembles(dtype, capability):
     """For all of a thread's registers, and a stack that thousands of threads can have."""
     if gpu_kernels.assembler() is None:
