@@ -174,7 +174,7 @@ def test_the_same_least_efforts(emulated):
     least = partial(harness.least, cone_edges=4)
     ours, theirs = harness.as_numpy(least(*data, margin)), on_xla(least, *data, margin)
     np.testing.assert_array_equal(ours.status, theirs.status)
-    assert (ours.status == jg.Status.SOLVED).mean() > 0.5
+    assert (ours.status == jg.Status.SOLVED).mean() > 0.4
     np.testing.assert_allclose(ours.effort, theirs.effort, rtol=1e-6, atol=1e-9)
 
 

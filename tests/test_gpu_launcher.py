@@ -14,6 +14,8 @@ from jaxgrasp import kernels
 from jaxgrasp.kernels import cuda, gpu, launcher, machine, native
 from jaxgrasp.solvers import lanes
 
+no_gpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="is about machines without a GPU")
+
 
 class Driver:
     """A driver that writes down what it is told, and an XLA that gives a stream."""
@@ -100,6 +102,7 @@ def test_structures_that_do_not_fit_launch_nothing():
     assert driver.launched == []
 
 
+@no_gpu
 def test_xla_hears_of_errors():
     """XLA's own structures: on a CPU it has no stream to give."""
     text = launcher.module("without_stream", kernel=1, launch=1, threads=64)
@@ -195,6 +198,7 @@ def doubled(parts):
     return parts[0] * 2
 
 
+@no_gpu
 def test_without_a_gpu_nothing_is_looked_for(monkeypatch):
     def look():
         raise AssertionError("it is looked for a GPU")
@@ -207,6 +211,7 @@ def test_without_a_gpu_nothing_is_looked_for(monkeypatch):
         assert kernels.usable() == (asked != "xla")
 
 
+@no_gpu
 def test_where_a_gpu_cannot_be_used_one_warning_says_why(monkeypatch):
     """JAX says that there is one, but not one of NVIDIA's."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
@@ -220,7 +225,7 @@ def test_where_a_gpu_cannot_be_used_one_warning_says_why(monkeypatch):
     native._works.cache_clear()
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="is about a GPU that is emulated")
+@no_gpu
 def test_a_kernel_that_does_not_load_is_left_to_xla(monkeypatch, tmp_path):
     def wrong(code, name, devices):
         raise RuntimeError("the GPU's driver does not load it")
@@ -233,7 +238,7 @@ def test_a_kernel_that_does_not_load_is_left_to_xla(monkeypatch, tmp_path):
         np.testing.assert_array_equal(out, np.full((3, 5), -6))
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="is about a GPU that is emulated")
+@no_gpu
 @pytest.mark.parametrize(("asked", "calls"), [("auto", 0), ("xla", 0), ("fused", 1)])
 def test_what_is_lowered_for_a_gpu(monkeypatch, tmp_path, asked, calls):
     """One call of a kernel where that is asked for; on the same machine's CPU, none."""

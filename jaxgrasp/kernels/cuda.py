@@ -42,8 +42,8 @@ def launch_address() -> int:
     return ctypes.cast(driver().cuLaunchKernel, ctypes.c_void_p).value or 0
 
 
-# The driver may write there whenever it assembles.
-_logs: list[Any] = []
+# Where the driver writes, which may be whenever it assembles.
+_written: list[Any] = []
 
 
 def kernel(ptx: bytes, name: str, devices: list[int]) -> int:
@@ -60,9 +60,9 @@ def kernel(ptx: bytes, name: str, devices: list[int]) -> int:
     """
     library = ctypes.c_void_p()
     log = ctypes.create_string_buffer(_LOG_BYTES)
-    _logs.append(log)
     options = (ctypes.c_int * 2)(_ERROR_LOG, _ERROR_LOG_BYTES)
     values = (ctypes.c_void_p * 2)(ctypes.addressof(log), _LOG_BYTES)
+    _written.append((log, options, values))
     code = driver().cuLibraryLoadData(
         ctypes.byref(library), ctypes.c_char_p(ptx), options, values, ctypes.c_uint(2), None, None, ctypes.c_uint(0)
     )
