@@ -197,8 +197,8 @@ def _works(platform: str) -> bool:
 @functools.cache
 def _tell(why: str) -> None:
     warnings.warn(
-        f"jaxgrasp's fused kernels are not used, XLA's slower ones are: {why} "
-        f"({SETTING}=xla in the environment asks for these, and is quiet)",
+        f"jaxgrasp's fused kernels are not used, XLA's are: {why} "
+        f"({SETTING}=xla in the environment asks for XLA's, and is quiet)",
         RuntimeWarning,
         stacklevel=2,
     )
