@@ -321,7 +321,7 @@ def test_the_setting(monkeypatch, tmp_path):
     done = run(SMALL, JAXGRASP_KERNELS="xla")
     assert done.stdout.strip() == "0.0" and "fused" not in done.stderr
     monkeypatch.setenv("JAXGRASP_KERNELS", "fast")
-    with pytest.raises(ValueError, match="JAXGRASP_KERNELS: got 'fast', wanted auto or xla"):
+    with pytest.raises(ValueError, match="JAXGRASP_KERNELS: got 'fast', wanted auto, xla or fused"):
         kernels.usable()
 
 

@@ -1,4 +1,4 @@
-"""Fused kernels: one jaxpr, compiled to vector code with one problem per SIMD lane."""
+"""Fused kernels: one jaxpr, as vector code with one problem per SIMD lane, or a GPU's with one per thread."""
 
 from jaxgrasp.kernels.native import fused, usable, without
 

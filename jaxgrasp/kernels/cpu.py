@@ -7,6 +7,7 @@ unpacked by XLA's own threads, which take them from a common counter. All of it 
 import math
 from collections.abc import Callable
 
+from jaxgrasp.kernels import machine
 from jaxgrasp.kernels.expressions import Unsupported, Value, kind_of
 from jaxgrasp.kernels.handler import HANDLER
 from jaxgrasp.kernels.lowering import Program
@@ -14,6 +15,8 @@ from jaxgrasp.kernels.schedule import scheduled
 from jaxgrasp.kernels.vector_code import VectorCode
 from jaxgrasp.kernels.waiting import blocks
 
+# As XLA calls the devices.
+PLATFORM = "cpu"
 # Bytes of a block's arguments and results on the stack of a thread.
 _MOST_STACK = 1 << 19
 # Blocks that a thread takes at a time, at most.
@@ -21,6 +24,32 @@ _CHUNK = 16
 # A call's data that its threads share, in words: rows, blocks, next block, blocks done, users, blocks at a time; then
 # pointers to arguments and results.
 _POINTERS = 6
+
+
+def description() -> str:
+    """Everything about the processor that compiled code depends on.
+
+    Raises:
+        Unavailable: there are no fused kernels here.
+    """
+    return machine.machine().description
+
+
+def compiled(program: Program, name: str) -> bytes:
+    """Object code of a program for the processor at hand, whose handler is `name`.
+
+    Raises:
+        Unsupported: see `module`.
+        RuntimeError: LLVM does not accept it.
+    """
+    at = machine.machine()
+    width = at.vector_bytes // program.builder.dtype.itemsize
+    return machine.compiled(module(program, name, width, estimates=at.estimates))
+
+
+def handler(code: bytes, name: str) -> int:
+    """Address of the function that XLA calls."""
+    return machine.loaded(code, name)
 
 
 def module(program: Program, name: str, width: int, *, estimates: bool) -> str:

@@ -9,17 +9,16 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from jaxgrasp.kernels import machine
 
-
-def of_origin(known_as: str, given: list[jax.ShapeDtypeStruct], shared: tuple[bool, ...]) -> str:
+def of_origin(known_as: str, given: list[jax.ShapeDtypeStruct], shared: tuple[bool, ...], described: str) -> str:
     """The same for functions that are known by the same name and get the same arguments.
 
-    It holds for one version of JAX and one state of the whole package, any file of which may be what is traced.
+    It holds for one version of JAX and one state of the whole package, any file of which may be what is traced, and
+    for the devices that are described.
     """
     package = _source(Path(__file__).parents[1])
     arguments = [(x.shape, x.dtype.name, s) for x, s in zip(given, shared, strict=True)]
-    parts = (package, machine.machine().description, jax.__version__, jax.config.read("jax_enable_x64"))
+    parts = (package, described, jax.__version__, jax.config.read("jax_enable_x64"))
     return hashlib.sha256(repr((*parts, known_as, arguments)).encode()).hexdigest()
 
 
@@ -30,10 +29,10 @@ def _source(folder: Path) -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
-def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...]) -> str:
-    """The same for programs that are the same, in any process on any machine of this kind."""
+def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], described: str) -> str:
+    """The same for programs that are the same, in any process with devices that are described so."""
     room = _source(Path(__file__).parent)
-    digest = hashlib.sha256(f"{room} {machine.machine().description} {shared}".encode())
+    digest = hashlib.sha256(f"{room} {described} {shared}".encode())
     numbers: dict[Any, int] = {}
 
     def name(v: Any) -> str:

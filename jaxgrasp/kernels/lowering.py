@@ -138,6 +138,8 @@ class _Lowering:
             return self.run(inner.jaxpr, [np.asarray(c) for c in inner.consts], args)
         if name in _CONTROL:
             return getattr(self, _CONTROL[name])(params, args)
+        if not eqn.outvars:
+            raise Unsupported(f"the operation {name}, which has no result")
         aval = eqn.outvars[0].aval
         if name in ELEMENTWISE:
             return [self.elementwise(ELEMENTWISE[name], args, aval)]

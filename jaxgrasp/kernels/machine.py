@@ -72,7 +72,7 @@ def compiled(code: str) -> bytes:
 
     module = llvm.parse_assembly(code)
     module.triple = llvm.get_process_triple()
-    with _in_given_order():
+    with in_given_order():
         return machine().target.emit_object(module)
 
 
@@ -81,7 +81,7 @@ _KNOWN_LLVM = range(18, 23)
 
 
 @contextlib.contextmanager
-def _in_given_order() -> Iterator[None]:
+def in_given_order() -> Iterator[None]:
     """Without LLVM's own order of instructions, which moves results away from where they are used.
 
     It takes a third of the compile time, and half as many loads and stores again.

@@ -1,8 +1,8 @@
 """Fused kernels: a batch function as one call of native code, where that can be had.
 
-`fused` takes a function of one problem. Its jaxpr is lowered to vector code, one problem per lane, and called through
-XLA's foreign function interface; kernels are kept in the process and on disk. Where anything is missing, XLA runs the
-same function instead, with one warning that says why.
+`fused` takes a function of one problem. Its jaxpr is lowered to vector code, one problem per lane, or to a GPU's, one
+problem per thread, and called through XLA's foreign function interface; kernels are kept in the process and on disk.
+Where anything is missing, XLA runs the same function instead, with one warning that says why.
 """
 
 import contextlib
@@ -17,19 +17,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import mlir
 
 from jaxgrasp.fence import loops
-from jaxgrasp.kernels import cpu, fingerprint, machine, outline
+from jaxgrasp.kernels import cpu, fingerprint, gpu, machine, outline
 from jaxgrasp.kernels.expressions import Unsupported
 from jaxgrasp.kernels.lowering import lowered
 from jaxgrasp.kernels.machine import Unavailable
 
 Tree = Any
 SETTING = "JAXGRASP_KERNELS"
+# What the setting may be: fused kernels on CPUs, nowhere, or on GPUs as well.
+_SETTINGS = ("auto", "xla", "fused")
+# What makes kernels, by the platforms' names in JAX.
+_MAKERS: dict[str, Any] = {"cpu": cpu, "cuda": gpu}
 _allowed = contextvars.ContextVar("allowed", default=True)
 _lock = threading.RLock()
 
@@ -50,6 +53,7 @@ def fused(
     shared: tuple[bool, ...],
     otherwise: Callable[[list[jax.Array]], Tree],
     known_as: str | None = None,
+    platform: str = "cpu",
 ) -> Tree:
     """Run a function over the leading axis of its arguments.
 
@@ -60,13 +64,14 @@ def fused(
         otherwise: the same function of `leaves`, for XLA, where there is no fused kernel.
         known_as: what tells the function from all others that this package's code can make of the same arguments; it is
             then not even traced where its kernel is on disk. None where nothing does.
+        platform: that the call is for, "cpu" or "cuda".
     """
-    if not _allowed.get() or not usable():
+    if not usable(platform):
         return otherwise(leaves)
     problems = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
     events = [x.shape if s else x.shape[1:] for x, s in zip(leaves, shared, strict=True)]
     given = [jax.ShapeDtypeStruct((*e, 1), x.dtype) for e, x in zip(events, leaves, strict=True)]
-    plan = _planned(function, given, shared, known_as)
+    plan = _planned(function, given, shared, known_as, platform)
     wanted, structure = jax.tree.flatten(plan.out)
     shapes = tuple(jax.core.ShapedArray((problems, *x.shape[:-1]), x.dtype) for x in wanted)
     flat = lambda *leaves: jax.tree.leaves(otherwise(list(leaves)))  # noqa: E731
@@ -81,12 +86,14 @@ class Plan:
     out: arrays like its results, one trailing axis of size 1.
     trace: makes its jaxpr.
     shared: for every argument, whether all problems share it.
+    platform: that it is for, "cpu" or "cuda".
     """
 
     key: str
     out: Tree
     trace: Callable[[], ClosedJaxpr]
     shared: tuple[bool, ...]
+    platform: str
 
 
 _origins: dict[str, tuple[str, Tree]] = {}
@@ -97,7 +104,10 @@ def _planned(
     given: list[jax.ShapeDtypeStruct],
     shared: tuple[bool, ...],
     known_as: str | None,
+    platform: str,
 ) -> Plan:
+    described = _MAKERS[platform].description()
+
     @functools.cache
     def traced() -> tuple[ClosedJaxpr, Tree]:
         with loops():
@@ -105,14 +115,14 @@ def _planned(
 
     def look() -> tuple[str, Tree]:
         jaxpr, out = traced()
-        return fingerprint.of_program(jaxpr, shared), jax.tree.map(lambda x: np.empty(x.shape, x.dtype), out)
+        return fingerprint.of_program(jaxpr, shared, described), jax.tree.map(lambda x: np.empty(x.shape, x.dtype), out)
 
     def trace() -> ClosedJaxpr:
         return traced()[0]
 
     if known_as is None:
-        return Plan(*look(), trace, shared)
-    origin = fingerprint.of_origin(known_as, given, shared)
+        return Plan(*look(), trace, shared, platform)
+    origin = fingerprint.of_origin(known_as, given, shared, described)
     if origin not in _origins:
         kept = machine.cached(origin)
         if kept is None:
@@ -121,7 +131,7 @@ def _planned(
         else:
             key, _, out = kept.partition(b"\n")
             _origins[origin] = key.decode(), outline.read(out)
-    return Plan(*_origins[origin], trace, shared)
+    return Plan(*_origins[origin], trace, shared, platform)
 
 
 # A primitive, so that kernels whose results nobody uses are never compiled.
@@ -142,26 +152,35 @@ def _lower(ctx: Any, *leaves: Any, plan: Plan, shapes: Any, otherwise: Any) -> A
 mlir.register_lowering(_fused_p, _lower)
 
 
-def usable() -> bool:
-    """Whether there are fused kernels here; says why not, once."""
-    if jax.default_backend() != "cpu":
-        return False
+def usable(platform: str = "cpu") -> bool:
+    """Whether what is traced now becomes fused kernels; says why not, once.
+
+    Args:
+        platform: "cpu", or "cuda", where they are used if asked for.
+
+    Raises:
+        ValueError: the setting is not known.
+    """
     asked = os.environ.get(SETTING, "auto")
-    if asked not in ("auto", "xla"):
-        raise ValueError(f"{SETTING}: got {asked!r}, wanted auto or xla")
-    return asked == "auto" and _works()
+    if asked not in _SETTINGS:
+        raise ValueError(f"{SETTING}: got {asked!r}, wanted {', '.join(_SETTINGS[:-1])} or {_SETTINGS[-1]}")
+    if not _allowed.get() or asked == "xla" or (platform == "cuda" and asked != "fused"):
+        return False
+    return jax.default_backend() == {"cpu": "cpu", "cuda": "gpu"}[platform] and _works(platform)
 
 
 @functools.cache
-def _works() -> bool:
+def _works(platform: str) -> bool:
     """Try the smallest kernel: where XLA's structures differ from what kernels expect, its result stays untouched."""
     try:
         machine.machine()
         start = np.arange(3, dtype=np.float32)
+        one = [jax.ShapeDtypeStruct((1,), np.float32)]
         with _lock:
-            name = target(_planned(lambda x: x[0] + 1, [jax.ShapeDtypeStruct((1,), np.float32)], (False,), None))
+            name = target(_planned(lambda x: x[0] + 1, one, (False,), None, platform))
         with jax.ensure_compile_time_eval():
-            out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(jnp.asarray(start))
+            given = jax.device_put(start, jax.local_devices(backend=_MAKERS[platform].PLATFORM.lower())[0])
+            out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(given)
         if not np.array_equal(np.asarray(out), start + 1):
             raise Unavailable("this version of XLA hands arrays over in another way")
     except Unavailable as error:
@@ -178,8 +197,8 @@ def _works() -> bool:
 @functools.cache
 def _tell(why: str) -> None:
     warnings.warn(
-        f"jaxgrasp's fused kernels are not used, XLA's slower ones are: {why} "
-        f"({SETTING}=xla in the environment asks for these, and is quiet)",
+        f"jaxgrasp's fused kernels are not used, XLA's are: {why} "
+        f"({SETTING}=xla in the environment asks for XLA's, and is quiet)",
         RuntimeWarning,
         stacklevel=2,
     )
@@ -207,25 +226,29 @@ def target(plan: Plan) -> str:
 
 
 def _registered(plan: Plan) -> str:
-    at, name = machine.machine(), f"jaxgrasp_{plan.key[:32]}"
-    objects = machine.cached(plan.key)
-    if objects is None:
-        # A hundred thousand small objects, and no garbage among them.
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
-            program = lowered(plan.trace(), list(plan.shared))
-            width = at.vector_bytes // program.builder.dtype.itemsize
-            objects = machine.compiled(cpu.module(program, name, width, estimates=at.estimates))
-        except RuntimeError as error:
-            _tell(f"a kernel does not compile: {error}")
-            raise Unsupported from None
-        finally:
-            if collecting:
-                gc.enable()
-        _keep(plan.key, objects)
-    jax.ffi.register_ffi_target(name, machine.capsule(machine.loaded(objects, name)), platform="cpu")
+    maker, name = _MAKERS[plan.platform], f"jaxgrasp_{plan.key[:32]}"
+    code = machine.cached(plan.key)
+    try:
+        if code is None:
+            code = _compiled(plan, name)
+            _keep(plan.key, code)
+        address = maker.handler(code, name)
+    except RuntimeError as error:
+        _tell(f"a kernel does not compile: {error}")
+        raise Unsupported from None
+    jax.ffi.register_ffi_target(name, machine.capsule(address), platform=maker.PLATFORM)
     return name
+
+
+def _compiled(plan: Plan, name: str) -> bytes:
+    # A hundred thousand small objects, and no garbage among them.
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        return _MAKERS[plan.platform].compiled(lowered(plan.trace(), list(plan.shared)), name)
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def _keep(key: str, content: bytes) -> None:

@@ -280,7 +280,7 @@ class VectorCode(Instructions):
         operands = [self.operand(x, kind) for x in args]
         if kind == "b":
             if op == "not":
-                return self.emit(f"xor {vector} {operands[0]}, splat (i1 true)")
+                return self.emit(f"xor {vector} {operands[0]}, {self.constant(True, 'b')}")
             return self.emit(f"{op} {vector} {', '.join(operands)}")
         if kind in "iu":
             return self.integer(op, vector, operands, kind)

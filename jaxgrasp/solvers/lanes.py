@@ -2,7 +2,8 @@
 
 A kernel is a function of arrays whose last axis is the lane; a leaf that all lanes share has a last axis of size 1. On
 CPUs it becomes native code where it can, see `kernels`; else XLA cuts the lanes into tiles that stay in the cache.
-Elsewhere they go at once. A kernel may have a stage with more lanes, one for each of several programs of a lane.
+Elsewhere they go at once, on GPUs as native code where that is asked for. A kernel may have a stage with more lanes,
+one for each of several programs of a lane.
 """
 
 import math
@@ -18,7 +19,7 @@ from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from jaxgrasp.fence import fences
-from jaxgrasp.kernels import fused
+from jaxgrasp.kernels import fused, usable
 
 Tree = Any
 # Values of all rows of a tile: its working set has to fit in the second-level cache, and XLA's CPU backend would cut
@@ -190,8 +191,13 @@ def tiled(
             out = lax.map(body, [x.reshape(count, tile, *x.shape[1:]) for x in own])
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
+    whole = partial(_in_turn, (first, *stages[1:]))
+
     def on_cpu() -> Tree:
-        return fused(partial(_in_turn, (first, *stages[1:])), leaves, shared, in_compact_tiles, known_as)
+        return fused(whole, leaves, shared, in_compact_tiles, known_as)
+
+    def on_gpu() -> Tree:
+        return fused(whole, leaves, shared, at_once, known_as, "cuda")
 
     def in_compact_tiles(leaves: list[jax.Array]) -> Tree:
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
@@ -210,12 +216,13 @@ def tiled(
 
         return in_tiles(leaves, min(size, lanes), one)
 
-    def elsewhere() -> Tree:
+    def at_once(leaves: list[jax.Array]) -> Tree:
         return in_tiles(leaves, min(LARGE_TILE, lanes), solve)
 
     if jax.default_backend() == "cpu":
         return on_cpu()
-    return lax.platform_dependent(cpu=on_cpu, default=elsewhere)
+    native = {"cpu": on_cpu, "cuda": on_gpu} if usable("cuda") else {"cpu": on_cpu}
+    return lax.platform_dependent(**native, default=lambda: at_once(leaves))
 
 
 def _in_turn(steps: Sequence[Callable[[Tree], Tree]], value: Tree) -> Tree:

@@ -1,0 +1,201 @@
+"""LLVM code of a program: one problem per thread of a GPU.
+
+Every value has a name and none is put in memory: the GPU's assembler knows how many registers a thread has. Loops go on
+and branches are taken as this thread's own problem asks.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxgrasp.kernels.expressions import Unsupported, Value
+from jaxgrasp.kernels.lowering import Guard, Loop
+from jaxgrasp.kernels.schedule import Schedule, in_memory
+from jaxgrasp.kernels.vector_code import VectorCode
+
+# Functions that GPUs have instructions for; what else there is would be calls into a library.
+_NATIVE = {"fma", "sqrt", "fabs", "floor"}
+
+
+class Names:
+    """Names of values, in place of `Registers`: a name holds until the step in which it was given ends.
+
+    Args:
+        code: where instructions go that read what lies in memory.
+    """
+
+    def __init__(self, code: "ThreadCode") -> None:
+        """See the class."""
+        self.code = code
+        self.names: dict[Value, str] = {}
+        self.outside: list[dict[Value, str]] = []
+
+    def fetch(self, value: Value) -> str:
+        """The name of a value; arguments are read where they are first needed."""
+        if value not in self.names:
+            assert in_memory(value), value.op
+            self.names[value] = self.code.read(value)
+        return self.names[value]
+
+    def put(self, value: Value, name: str) -> None:
+        """A value that was computed."""
+        self.names[value] = name
+
+    def enter(self) -> None:
+        """A step begins."""
+        self.outside.append(dict(self.names))
+
+    def leave(self) -> None:
+        """It ends, and with it the names that were given in it."""
+        self.names = self.outside.pop()
+
+
+class ThreadCode(VectorCode):
+    """Writes instructions on scalars.
+
+    Args:
+        dtype: of numbers.
+    """
+
+    def __init__(self, dtype: np.dtype) -> None:
+        """See the class."""
+        super().__init__(dtype, 1, estimates=False)
+        self.types = {"f": self.scalar, "i": "i32", "b": "i1", "u": "i64"}
+        self.registers = Names(self)
+        self.before: dict[Loop | Guard, str] = {}
+        self.heads: dict[Loop, int] = {}
+
+    def write(self, schedule: Schedule, result: Callable[[int, str], None]) -> None:
+        """Write a whole program.
+
+        Args:
+            schedule: its events.
+            result: told the number and the name of every result.
+
+        Raises:
+            Unsupported: it needs functions that GPUs have no instructions for.
+        """
+        self.fused = schedule.fused
+        for event in schedule.events:
+            step = event.subject
+            if event.what == "compute":
+                self.registers.put(step, self.instruction(step))
+            elif event.what == "store":
+                result(step, self.registers.fetch(event.uses[0]) if event.uses else "")
+            elif event.what == "test":
+                self.branch(self.operand(step.condition, "b"), step)
+            elif isinstance(step, Loop):
+                (self.begin_loop if event.what == "enter" else self.end_loop)(step)
+            else:
+                (self.begin_guard if event.what == "enter" else self.end_guard)(step)
+
+    # Steps
+
+    def begin_loop(self, loop: Loop) -> None:
+        """Carried values have a new name in every round; where they come from is written at the loop's end."""
+        initial = [self.operand(x, kind) for x, kind in zip(loop.initial, loop.kinds, strict=True)]
+        head = self.label("head")
+        self.labels[loop] = (head, self.label("body"), self.label("after"))
+        self.before[loop] = self.block
+        self.do(f"br label %{head}")
+        self.registers.enter()
+        self.enter(head)
+        self.heads[loop] = len(self.lines)
+        names = []
+        for start, kind in zip(initial, loop.kinds, strict=True):
+            names.append(self.emit(f"phi {self.types[kind]} [ {start}, %{self.before[loop]} ]"))
+        self.slots[loop] = names
+        if loop.counter is not None:
+            self.registers.put(loop.counter, self.emit(f"phi i64 [ 0, %{self.before[loop]} ]"))
+
+    def end_loop(self, loop: Loop) -> None:
+        """Round again, or past it."""
+        head, _, after = self.labels[loop]
+        following = [self.operand(x, kind) for x, kind in zip(loop.outputs, loop.kinds, strict=True)]
+        if loop.rounds is None:
+            carried, left = following, self.slots[loop]
+            self.do(f"br label %{head}")
+        else:
+            counter = loop.counter
+            assert counter is not None
+            number = self.emit(f"add i64 {self.registers.fetch(counter)}, 1")
+            again = self.emit(f"icmp ult i64 {number}, {loop.rounds}")
+            carried, left = [*following, number], following
+            self.do(f"br i1 {again}, label %{head}, label %{after}")
+        for line, name in enumerate(carried, self.heads[loop]):
+            self.lines[line] += f", [ {name}, %{self.block} ]"
+        self.registers.leave()
+        self.slots[loop] = left
+        self.enter(after)
+
+    def begin_guard(self, guard: Guard) -> None:
+        """Code that is jumped over where this problem does not need it."""
+        asked = self.operand(guard.condition, "b")
+        self.labels[guard] = ("", self.label("guarded"), self.label("after"))
+        self.before[guard] = self.block
+        self.registers.enter()
+        self.branch(asked, guard)
+
+    def end_guard(self, guard: Guard) -> None:
+        """Its results, which are zero where it was jumped over."""
+        after, inside = self.labels[guard][2], []
+        for value in guard.outputs:
+            inside.append((self.types[value.kind], self.operand(value, value.kind)))
+        end = self.block
+        self.do(f"br label %{after}")
+        self.registers.leave()
+        self.enter(after)
+        nothing = f"[ zeroinitializer, %{self.before[guard]} ]"
+        self.slots[guard] = [self.emit(f"phi {kind} [ {name}, %{end} ], {nothing}") for kind, name in inside]
+
+    def branch(self, asked: str, step: Loop | Guard) -> None:
+        """Into the step, or past it."""
+        _, inside, after = self.labels[step]
+        self.do(f"br i1 {asked}, label %{inside}, label %{after}")
+        self.enter(inside)
+
+    # Scalars
+
+    def operand(self, x: Any, kind: str) -> str:
+        """The name or literal of a scalar."""
+        if type(x) is not Value:
+            return self.constant(x, kind)
+        name = self.registers.fetch(x)
+        return self.emit(f"trunc i64 {name} to i32") if x.kind == "u" and kind != "u" else name
+
+    def constant(self, value: Any, kind: str) -> str:
+        """A literal."""
+        if kind == "f":
+            return self.float_literal(value)
+        return ("true" if value else "false") if kind == "b" else str(int(value))
+
+    def intrinsic(self, name: str, *operands: str) -> str:
+        """A call of one of LLVM's own functions, which becomes an instruction."""
+        if name not in _NATIVE:
+            raise Unsupported(f"the function {name} on a GPU")
+        full = f"@llvm.{name}.f{8 * self.dtype.itemsize}"
+        self.declare(f"declare {self.scalar} {full}({', '.join([self.scalar] * len(operands))})")
+        return self.emit(f"call {self.scalar} {full}({', '.join(f'{self.scalar} {x}' for x in operands)})")
+
+    # Memory
+
+    def read(self, value: Value) -> str:
+        """An argument, or what a step carries or leaves."""
+        if value.op in ("carry", "result"):
+            step, index = value.args
+            return self.slots[step][index]
+        number, index = value.args
+        unit = {"f": self.scalar, "i": "i32", "b": "i8"}[value.kind]
+        place = self.place(index, unit, self.own[number])
+        found = self.emit(f"load {unit}, ptr addrspace(1) {place}")
+        return self.emit(f"icmp ne i8 {found}, 0") if value.kind == "b" else found
+
+    def place(self, index: tuple, unit: str, base: str) -> str:
+        """Address of an entry: a known one, or so many strides further as a counter says."""
+        offset, counter, stride = index
+        place = str(offset)
+        if counter is not None:
+            moved = self.emit(f"mul i64 {self.registers.fetch(counter)}, {stride}")
+            place = self.emit(f"add i64 {moved}, {offset}")
+        return self.emit(f"getelementptr {unit}, ptr addrspace(1) {base}, i64 {place}")
