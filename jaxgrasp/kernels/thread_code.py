@@ -12,7 +12,7 @@ import numpy as np
 from jaxgrasp.kernels.expressions import Unsupported, Value
 from jaxgrasp.kernels.lowering import Guard, Loop
 from jaxgrasp.kernels.schedule import Schedule, in_memory
-from jaxgrasp.kernels.vector_code import VectorCode
+from jaxgrasp.kernels.value_code import ValueCode
 
 # Functions that GPUs have instructions for; what else there is would be calls into a library.
 _NATIVE = {"fma", "sqrt", "fabs", "floor"}
@@ -51,7 +51,7 @@ class Names:
         self.names = self.outside.pop()
 
 
-class ThreadCode(VectorCode):
+class ThreadCode(ValueCode):
     """Writes instructions on scalars.
 
     Args:
