@@ -13,9 +13,9 @@ from jaxgrasp.kernels.value_code import ValueCode
 
 
 def main_loop(schedule: Schedule) -> Loop | None:
-    """The loop that goes on for as long as any problem's condition holds, if there is one that is in no other."""
+    """The last loop that goes on for as long as any problem's condition holds and is in no other, if there is one."""
     loops = [e.subject for e in schedule.events if e.what == "test" and e.subject.body.depth == 1]
-    return loops[0] if len(loops) == 1 else None
+    return loops[-1] if loops else None
 
 
 class VectorCode(ValueCode):
