@@ -125,8 +125,8 @@ def test_what_was_found_before_an_interrupt_is_kept(hand, found):
 @pytest.mark.thorough
 def test_torque_limits_count_on_the_way(hand, found):
     limited = synthesize_hand_grasps(hand, jax.random.key(0), starts=STARTS, steps=STEPS, torque_limits=True)
-    # Starts are good with probability 0.94 (180 of 192 with six keys); of 32, fewer than nine tenths then are good every
-    # eighth time, and rounding decides. What fails is what would be surprising if it were nine tenths.
+    # Starts are good with probability 0.94 (180 of 192 with six keys); of 32, fewer than nine tenths then are good one
+    # time in eight, and rounding decides. What fails is what would be surprising if it were nine tenths.
     assert stats.binomtest(int(limited.good.sum()), STARTS, 0.9, alternative="less").pvalue > 0.01
     # The first margins are those of the same starts, with less that the hand can do.
     assert (limited.record["margin"][0] <= found.record["margin"][0] + 1e-4).all()

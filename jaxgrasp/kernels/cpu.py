@@ -13,7 +13,7 @@ from jaxgrasp.kernels.handler import HANDLER
 from jaxgrasp.kernels.lowering import Program
 from jaxgrasp.kernels.schedule import scheduled
 from jaxgrasp.kernels.vector_code import VectorCode
-from jaxgrasp.kernels.waiting import blocks
+from jaxgrasp.kernels.waiting import blocks, waits
 
 # As XLA calls the devices.
 PLATFORM = "cpu"
@@ -74,6 +74,7 @@ def module(program: Program, name: str, width: int, *, estimates: bool) -> str:
         "@FUNCTIONS@": code.written(),
         "@BLOCK@": blocks(code),
         "@FRAME_BYTES@": str(max(code.used, 64)),
+        "@REST_BYTES@": str(code.used if waits(code) else 64),
         "@BOOK@": str(1 + 3 * width),
         "@DECLARATIONS@": "\n".join(sorted(code.declarations)),
         "@STATE_BYTES@": str(8 * (_POINTERS + count)),
@@ -162,7 +163,7 @@ def _unpacking(program: Program, code: VectorCode, results: list[tuple[str, int,
     code.do(f"br label %{done}")
     code.enter(done)
     code.do("ret void")
-    if code.main is None:
+    if not waits(code):
         return
     code.begin("void @unpack_rows(ptr noalias %state, ptr noalias %rows, i64 %valid, ptr noalias %frame)")
     for number, (place, count, kind) in zip(pointers, results, strict=True):

@@ -17,7 +17,7 @@ declare i32 @sched_yield()
 define internal void @take(ptr %state) {
 entry:
   %frame = alloca [@FRAME_BYTES@ x i8], align 64
-  %rest = alloca [@FRAME_BYTES@ x i8], align 64
+  %rest = alloca [@REST_BYTES@ x i8], align 64
   %book = alloca [@BOOK@ x i64]
   store i64 0, ptr %book
   %blocks.p = getelementptr i64, ptr %state, i64 1

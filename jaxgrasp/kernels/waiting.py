@@ -10,9 +10,13 @@ where to where lanes are being moved.
 
 from jaxgrasp.kernels.vector_code import VectorCode
 
+# Bytes of two frames, which are on a thread's stack; where they would be more, nothing waits.
+_MOST_STACK = 3 << 17
+
 _ALONE = """
 define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
   call void @before(ptr %state, i64 %number, ptr %frame)
+@ROUNDS@
   call void @unpack(ptr %state, i64 %number, ptr %frame)
   ret void
 }
@@ -21,6 +25,9 @@ define internal void @finish(ptr %state, ptr %rest, ptr %book) {
   ret void
 }
 """
+
+_ROUNDS = """  %finished = call i64 @rounds(ptr %state, ptr %frame, i64 0)
+  call void @after(ptr %state, ptr %frame)"""
 
 # A value of all lanes is a line of the cache: each is touched once.
 _MOVE = """
@@ -178,10 +185,15 @@ out:
 """
 
 
+def waits(code: VectorCode) -> bool:
+    """Whether there is a loop that some problems take longer for, and room for a second frame."""
+    return code.main is not None and 2 * code.used <= _MOST_STACK
+
+
 def blocks(code: VectorCode) -> str:
     """The functions `block` and `finish` of a program that is written."""
-    if code.main is None:
-        return _ALONE
+    if not waits(code):
+        return _ALONE.replace("@ROUNDS@", _ROUNDS if code.main else "")
     width, few = code.width, code.width // 4
     values = {
         "@MOVES@": _moves(width),
