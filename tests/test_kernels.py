@@ -131,6 +131,27 @@ def test_sums_of_products_with_every_sign(dtype):
     assert_same(function, 1 + jnp.abs(rows(20, 40, dtype=dtype)))
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_sums_with_constants_in_common(dtype):
+    """The constants are taken out, from sums of values and of products, alone or among others."""
+
+    def function(x, whole):
+        return {
+            "two": 0.3 * x[0] + 0.3 * x[1],
+            "products": 0.3 * (x[2] * x[3]) + 0.3 * (x[4] * x[5]),
+            "inside": (0.3 * x[6]) * x[7] + (0.3 * x[8]) * x[9] + x[10] * x[11],
+            "signs": x[12] - 0.7 * x[13] - 0.7 * x[14] + x[15] * x[16],
+            "turned": -(0.7 * x[17]) - 0.7 * (x[18] * x[19]),
+            "others": 0.3 * x[20] + 0.7 * x[21] + 0.3 * x[22] - 0.7 * x[23] + x[24],
+            "of constants": -0.5 * (0.25 * x[25]) + 1e-30 * (1e-30 * x[26]),
+            "largest": jnp.maximum(-x[27], -x[28]),
+            "whole": -3 * whole + 2 * (5 * whole),
+        }
+
+    whole = jnp.asarray(np.arange(20)[:, None] - 7, jnp.int32)
+    assert_same(function, 1 + jnp.abs(rows(20, 30, dtype=dtype)), whole)
+
+
 def test_loops_end_for_each_problem_by_itself():
     """Newton's iteration: some problems take long, and none goes on after its end."""
 

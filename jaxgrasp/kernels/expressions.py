@@ -160,7 +160,7 @@ class Builder:
                         return self.make("neg", self.make("mul", x.args[0], y))
                     if type(x) is not Value and x < 0:
                         return self.make("neg", self.make("mul", -x, y))
-                    if type(x) is not Value and y.op == "mul" and type(y.args[0]) is not Value:
+                    if type(x) is not Value and y.kind == "f" and y.op == "mul" and type(y.args[0]) is not Value:
                         both = x * y.args[0]
                         if np.isfinite(both) and abs(both) >= np.finfo(both.dtype).tiny:
                             return self.make("mul", both, y.args[1])

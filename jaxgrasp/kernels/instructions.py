@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 # Bytes of a frame that AVX-512's instructions reach from a pointer with one byte in place of four, and how many such
-# pointers are kept. A kernel's loop is more code than a cache holds: reading it is what takes the time.
+# pointers are kept. A kernel's loop is more code than the first cache holds.
 _NEAR, _POINTERS = 1 << 14, 7
 
 
@@ -169,17 +169,17 @@ class Instructions:
         self.declare(f"declare {vector} {full}({vector}, {vector}, {mask})")
         return self.emit(f"call {vector} {full}({vector} {x}, {vector} zeroinitializer, {mask} -1)")
 
-    def improved(self, inverse: str, lacking: str, step: str, exact: str | None = None) -> tuple[str, str]:
+    def improved(self, inverse: str, lacking: str, step: str, where: str | None) -> tuple[str, str]:
         """One step of Newton's; none where the estimate is exact: x is zero, infinite or NaN, or as good as that.
 
         Args:
             inverse: what is improved.
             lacking: by which share it is short.
             step: what a unit of this share is worth.
-            exact: where it is to be done, if that is known already.
+            where: it is to be done, None if that is not known yet; returned as well.
         """
         vector = self.types["f"]
-        mask = exact or self.emit(f"fcmp ogt {vector} {lacking}, {self.constant(-1, 'f')}")
+        mask = where or self.emit(f"fcmp ogt {vector} {lacking}, {self.constant(-1, 'f')}")
         better = self.multiply_add(step, lacking, inverse)
         return self.emit(f"select {self.types['b']} {mask}, {vector} {better}, {vector} {inverse}"), mask
 

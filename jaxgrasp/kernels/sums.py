@@ -57,9 +57,14 @@ def _chain(root: Value, count: Counter[Value], left: list[Value]) -> None:
             stack += [(second, positive == (x.op == "add")), (first, positive)]
         else:
             terms.append((x, positive))
+    count_before = len(terms)
     terms = _constants_taken_out(terms, root, count, left)
+    if len(terms) == 1:
+        # Something positive was first, so that this is.
+        root.op, root.args = "mul", terms[0][0].args
+        return
     products = [t for t in terms if type(t[0]) is Value and t[0].op == "mul" and _belongs(t[0], root, count)]
-    if len(terms) < 3 or len(products) < 2:
+    if len(terms) == count_before and (len(terms) < 3 or len(products) < 2):
         left += parts
         return
     chosen = {id(x) for x, _ in products}
