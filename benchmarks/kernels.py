@@ -136,7 +136,7 @@ def flops(jaxpr, shared, iterations: float) -> float:
     return total
 
 
-CHAINS, IN_TURN, LOOPS = 16, 64, 50
+CHAINS, IN_TURN, LOOPS = 16, 16, 200
 
 
 def multiply_adds(batch: int, dtype: str):
