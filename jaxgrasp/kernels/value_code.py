@@ -1,5 +1,6 @@
 """Instructions for values: what vectors of problems and single ones have in common."""
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ _INTEGER_CONDITIONS = {"eq": "eq", "ne": "ne", "lt": "slt", "le": "sle", "gt": "
 _INTRINSICS = {"sqrt": "sqrt", "exp": "exp", "log": "log", "floor": "floor", "abs": "fabs"}
 
 
-class ValueCode(Instructions):
+class ValueCode(Instructions, ABC):
     """Writes instructions for values, whose operands have names.
 
     own: where each argument lies that every problem has for itself.
@@ -32,9 +33,9 @@ class ValueCode(Instructions):
         self.slots: dict[Loop | Guard, list[str]] = {}
         self.labels: dict[Loop | Guard, tuple[str, str, str]] = {}
 
+    @abstractmethod
     def operand(self, x: Any, kind: str) -> str:
         """The name or literal of a scalar."""
-        raise NotImplementedError
 
     def choice(self, value: Value, mask: str) -> str:
         """A select, by a mask that is written already."""
