@@ -76,4 +76,4 @@ for name, forces in list(tightening.items())[1:]:
 write_figure(figure_of_pushes(dict(list(shown.items())[1:]), NAMES), "push_at_rest.png")
 panels = [(f"{name}, +z", part, 4) for name, part in list(shown.items())[1:]]
 write_movie("push_at_rest.gif", sim.hand.model, panels, begin=0.08, end=0.34, slower=10)
-print("written: push_at_rest.gif, push_at_rest.png")
+print("written: push_at_rest.gif", "written: push_at_rest.png", sep="\n")
