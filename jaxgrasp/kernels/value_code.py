@@ -117,3 +117,11 @@ class ValueCode(Instructions, ABC):
         if op == "sub":
             other, a = (self.negative(other), a) if first else (other, self.negative(a))
         return self.multiply_add(a, b, other)
+
+    def offset(self, index: tuple) -> str:
+        """Which entry of an array: a known one, or so many strides further as a counter says."""
+        known, counter, stride = index
+        if counter is None:
+            return str(known)
+        moved = self.emit(f"mul i64 {self.operand(counter, 'u')}, {stride}")
+        return self.emit(f"add i64 {moved}, {known}")

@@ -244,13 +244,8 @@ class VectorCode(ValueCode):
     # Memory
 
     def place(self, index: tuple, unit: str, base: str) -> str:
-        """Address of an entry: a known one, or so many strides further as a counter says."""
-        offset, counter, stride = index
-        place = str(offset)
-        if counter is not None:
-            moved = self.emit(f"mul i64 {self.registers.fetch(counter)}, {stride}")
-            place = self.emit(f"add i64 {moved}, {offset}")
-        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {place}")
+        """Address of an entry."""
+        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {self.offset(index)}")
 
     def load_own(self, kind: str, number: int, index: tuple) -> str:
         """A different number for every lane."""
