@@ -78,7 +78,7 @@ def _constants_taken_out(
     terms: list[tuple[Any, bool]], root: Value, count: Counter[Value], left: list[Value]
 ) -> list[tuple[Any, bool]]:
     """Terms, those with the same constant as one: it times their sum."""
-    alike: dict[Any, list[tuple[Any, bool]]] = {}
+    alike: dict[Any, list[tuple[Value, Any, bool]]] = {}
     kept: list[tuple[Any, bool]] = []
     for x, positive in terms:
         constant, other = _constant_of(x, root, count)

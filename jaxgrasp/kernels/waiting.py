@@ -11,7 +11,7 @@ where to where lanes are being moved.
 from jaxgrasp.kernels.vector_code import VectorCode
 
 # Bytes of two frames, which are on a thread's stack; where they would be more, nothing waits.
-_MOST_STACK = 3 << 17
+_MOST_FRAMES = 3 << 17
 
 _ALONE = """
 define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
@@ -187,7 +187,7 @@ out:
 
 def waits(code: VectorCode) -> bool:
     """Whether there is a loop that some problems take longer for, and room for a second frame."""
-    return code.main is not None and 2 * code.used <= _MOST_STACK
+    return code.main is not None and 2 * code.used <= _MOST_FRAMES
 
 
 def blocks(code: VectorCode) -> str:
