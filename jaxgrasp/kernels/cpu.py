@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from jaxgrasp.kernels import machine
 from jaxgrasp.kernels.expressions import Unsupported, Value, kind_of
-from jaxgrasp.kernels.handler import HANDLER
+from jaxgrasp.kernels.handler import HANDLER, SPOIL
 from jaxgrasp.kernels.lowering import Program
 from jaxgrasp.kernels.schedule import scheduled
 from jaxgrasp.kernels.vector_code import VectorCode
@@ -44,7 +44,7 @@ def compiled(program: Program, name: str) -> bytes:
     """
     at = machine.machine()
     width = at.vector_bytes // program.builder.dtype.itemsize
-    return machine.compiled(module(program, name, width, estimates=at.estimates))
+    return machine.compiled(module(program, name, width, estimates=at.estimates, spoilt=at.spoilt))
 
 
 def handler(code: bytes, name: str) -> int:
@@ -52,7 +52,7 @@ def handler(code: bytes, name: str) -> int:
     return machine.loaded(code, name)
 
 
-def module(program: Program, name: str, width: int, *, estimates: bool) -> str:
+def module(program: Program, name: str, width: int, *, estimates: bool, spoilt: bool = False) -> str:
     """LLVM code of the handler `name` and all that it calls.
 
     Args:
@@ -60,6 +60,7 @@ def module(program: Program, name: str, width: int, *, estimates: bool) -> str:
         name: of the handler.
         width: lanes of a vector.
         estimates: whether the processor has AVX-512's estimates of reciprocals.
+        spoilt: whether all bits of a thread's memory are set before each use.
 
     Raises:
         Unsupported: a block's data are too large, or of a type that is not known.
@@ -73,6 +74,7 @@ def module(program: Program, name: str, width: int, *, estimates: bool) -> str:
         "@NAME@": f"@{name}",
         "@FUNCTIONS@": code.written(),
         "@BLOCK@": blocks(code),
+        "@SPOIL@": SPOIL if spoilt else "",
         "@FRAME_BYTES@": str(max(code.used, 64)),
         "@REST_BYTES@": str(code.used if waits(code) else 64),
         "@BOOK@": str(1 + 3 * width),

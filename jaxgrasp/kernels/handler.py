@@ -9,6 +9,7 @@ HANDLER = """
 declare ptr @malloc(i64)
 declare void @free(ptr)
 declare i32 @sched_yield()
+declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)
 @DECLARATIONS@
 
 @FUNCTIONS@
@@ -39,6 +40,7 @@ work:
   br label %one
 one:
   %number = phi i64 [ %from, %work ], [ %following, %one ]
+@SPOIL@
   call void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book)
   %following = add i64 %number, 1
   %again = icmp ult i64 %following, %to
@@ -216,3 +218,10 @@ end:
 
 attributes #0 = { nounwind }
 """
+
+# Before each block, for tests: no bit of its frame is what it was, nor of the second one where no lane waits there.
+SPOIL = """  %waiting = load i64, ptr %book
+  %nobody = icmp eq i64 %waiting, 0
+  %unused = select i1 %nobody, i64 @REST_BYTES@, i64 0
+  call void @llvm.memset.p0.i64(ptr %frame, i8 -1, i64 @FRAME_BYTES@, i1 false)
+  call void @llvm.memset.p0.i64(ptr %rest, i8 -1, i64 %unused, i1 false)"""

@@ -12,6 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 
+SETTING = "JAXGRASP_VECTOR_BITS"
+# What narrower vectors than the processor's are made without.
+_WITHOUT = {128: ",-avx2", 256: ",-avx512f", 512: ""}
+
+
 class Unavailable(Exception):
     """Why there are no fused kernels here."""
 
@@ -23,20 +28,35 @@ class Machine(NamedTuple):
     vector_bytes: size of a vector register.
     estimates: whether it has AVX-512's estimates of reciprocals.
     description: everything that compiled code depends on.
+    spoilt: whether all bits of a thread's memory are set before each use, so that tests see what is read unwritten.
     """
 
     target: Any
     vector_bytes: int
     estimates: bool
     description: str
+    spoilt: bool = False
 
 
 @functools.cache
 def machine() -> Machine:
-    """The processor at hand.
+    """The processor at hand, with vectors as long as the environment asks for, else as long as they can be.
 
     Raises:
-        Unavailable: no llvmlite, or a processor without fused multiply-add.
+        Unavailable: see `with_vectors`.
+        ValueError: the environment asks for what is not known.
+    """
+    asked = os.environ.get(SETTING, "auto")
+    if asked not in ("auto", *map(str, _WITHOUT)):
+        raise ValueError(f"{SETTING}: got {asked!r}, wanted auto, {', '.join(map(str, _WITHOUT))}")
+    return with_vectors(None if asked == "auto" else int(asked))
+
+
+def with_vectors(bits: int | None) -> Machine:
+    """The processor at hand, with vectors of so many bits; None for the longest.
+
+    Raises:
+        Unavailable: no llvmlite, a processor without fused multiply-add, or without such vectors.
     """
     if os.name != "posix":
         raise Unavailable("this operating system is not supported")
@@ -53,13 +73,20 @@ def machine() -> Machine:
         wide = all(features.get(f, False) for f in ("avx512f", "avx512dq", "avx512vl"))
         if not (features.get("fma", False) or triple.startswith(("aarch64", "arm64"))):
             raise Unavailable(f"the processor {name or 'at hand'} has no fused multiply-add")
-        flags = features.flatten() + (",-prefer-256-bit" if wide else "")
+        longest = 512 if wide else 256 if features.get("avx2", False) else 128
+        bits = bits or longest
+        if bits > longest:
+            raise Unavailable(f"vectors of {bits} bits are asked for ({SETTING}), the processor has {longest}")
+        flags = features.flatten()
+        if bits < longest:
+            flags += _WITHOUT[bits]
+        elif wide:
+            flags += ",-prefer-256-bit"
         # The lower level compiles faster, and code here has been put in order already.
         target = llvm.Target.from_triple(triple).create_target_machine(cpu=name, features=flags, opt=1)
     except RuntimeError as error:
         raise Unavailable(f"LLVM does not know the processor: {error}") from None
-    size = 64 if wide else 32 if features.get("avx2", False) else 16
-    return Machine(target, size, wide, f"{llvmlite.__version__} {triple} {name} {flags}")
+    return Machine(target, bits // 8, bits == 512, f"{llvmlite.__version__} {triple} {name} {flags}")
 
 
 def compiled(code: str) -> bytes:
