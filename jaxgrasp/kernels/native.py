@@ -34,6 +34,7 @@ _SETTINGS = ("auto", "xla", "fused")
 # What makes kernels, by the platforms' names in JAX.
 _MAKERS: dict[str, Any] = {"cpu": cpu, "cuda": gpu}
 _allowed = contextvars.ContextVar("allowed", default=True)
+_trusted = True
 _lock = threading.RLock()
 
 
@@ -45,6 +46,12 @@ def without() -> Iterator[None]:
         yield
     finally:
         _allowed.reset(token)
+
+
+def distrust() -> None:
+    """Have XLA run whatever is traced from now on: an answer of a kernel was found wrong."""
+    global _trusted
+    _trusted = False
 
 
 def fused(
@@ -164,7 +171,7 @@ def usable(platform: str = "cpu") -> bool:
     asked = os.environ.get(SETTING, "auto")
     if asked not in _SETTINGS:
         raise ValueError(f"{SETTING}: got {asked!r}, wanted {', '.join(_SETTINGS[:-1])} or {_SETTINGS[-1]}")
-    if not _allowed.get() or asked == "xla" or (platform == "cuda" and asked != "fused"):
+    if not _trusted or not _allowed.get() or asked == "xla" or (platform == "cuda" and asked != "fused"):
         return False
     return jax.default_backend() == {"cpu": "cpu", "cuda": "gpu"}[platform] and _works(platform)
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxgrasp.arrays import as_float, broadcast_batch, fold
+from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, inverse_root
@@ -17,7 +16,8 @@ from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
-from jaxgrasp.disturbance.vertices import Vertices
+from jaxgrasp.robustness.arguments import laid_out
+from jaxgrasp.robustness.auditing import audited
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
 from jaxgrasp.solvers.lanes import LOOSE_TILE, TILE
@@ -89,7 +89,7 @@ def over_grasps(
     cutoff: Any = None,
     actuation: Any = None,
 ) -> Any:
-    """Check shapes, run a kernel over all grasps of a batch and give its results the batch's shape.
+    """Check shapes, run a kernel over all grasps of a batch, audit its results and give them the batch's shape.
 
     The kernel takes `Grasps`. The contacts' dtype is the precision of everything. Compiled once for a kernel (they
     compare by value) and the shapes.
@@ -116,121 +116,33 @@ def over_grasps(
     if actuation is not None and not isinstance(actuation, Actuation):
         raise ValueError(f"actuation: got {type(actuation).__name__}, wanted jaxgrasp.Actuation")
     given["actuation"] = actuation
-    return _run(kernel, contacts, disturbances, given)
+    return audited(kernel, _run(kernel, contacts, disturbances, given), contacts, disturbances, given)
 
 
 @functools.partial(compiled, static_argnums=(0,))
 def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Any:
-    """Lay the arguments out in lanes: which leaves have the batch axes, and which all grasps share."""
-    required_wrench, compliance, cone_margin = given["required_wrench"], given["compliance"], given["cone_margin"]
-    effort_weights = given["effort_weights"]
+    """Run the kernel over the lanes."""
+    arguments = laid_out(contacts, disturbances, given)
     n = contacts.n_c
-    own = {name: (getattr(contacts, name), contacts.batch_shape) for name in _CONTACT_LEAVES}
-    other: dict[str, tuple[Any, tuple[int, ...]]] = {
-        "wrench": _argument("required_wrench", np.zeros(6) if required_wrench is None else required_wrench, (6,)),
-        "reserve": _argument("cone_margin", cone_margin, ()),
-    }
-    if isinstance(compliance, Compliance):
-        other["per_vertex"] = _per_vertex(compliance, disturbances, n)
-    elif compliance is not None:
-        other["compliance"] = _compliance(compliance, n)
-    if effort_weights is not None:
-        other["weights"] = _argument("effort_weights", effort_weights, (n, 3, 3))
-    for name in ("margin", "smoothing", "cutoff"):
-        if given[name] is not None:
-            other[name] = _argument(name, given[name], ())
-    if given["actuation"] is not None:
-        other |= _actuation(given["actuation"], n)
-    batch = broadcast_batch(
-        contacts=contacts.batch_shape,
-        disturbances=disturbances.batch_shape,
-        **{_PUBLIC.get(name, name): lead for name, (_, lead) in other.items()},
-    )
-    dtype = contacts.positions.dtype
-    terms, structure = jax.tree.flatten(disturbances.spread_over(batch) if disturbances.batch_shape else disturbances)
-    lead = batch if disturbances.batch_shape else ()
-    spread = jax.tree.unflatten(structure, terms)
-    leaves = {**own, **other, **{f"term {i}": (leaf, lead) for i, leaf in enumerate(terms)}}
-    leaves |= {f"extent {i}": (jax.lax.stop_gradient(term.extent()), lead) for i, term in enumerate(spread.terms)}
-
-    arguments, shared = {}, {}
-    for name, (leaf, lead) in leaves.items():
-        leaf = leaf if leaf.dtype == bool else leaf.astype(dtype)
-        shared[name] = not lead and name not in own
-        if not shared[name]:
-            event = leaf.shape[len(lead) :]
-            leaf = jnp.broadcast_to(leaf, (*batch, *event)).reshape(-1, *event)
-        arguments[name] = leaf
+    leaves, batch = arguments.leaves, arguments.batch
 
     def admit(raw: dict[str, jax.Array]) -> Grasps:
-        terms = jax.tree.unflatten(structure, [raw[f"term {i}"] for i in range(structure.num_leaves)])
-        extents = tuple(raw[f"extent {i}"] for i in range(len(terms.terms)))
-        return _admit(raw, terms.terms, extents)
+        terms = arguments.terms(raw)
+        return _admit(raw, terms, tuple(raw[f"extent {i}"] for i in range(len(terms))))
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = kernel.tile is None and not {"compliance", "per_vertex", "weights"} & set(arguments)
+    compact = kernel.tile is None and not {"compliance", "per_vertex", "weights"} & set(leaves)
     rows = n * (kernel.rows + 1)
     if given["actuation"] is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.
         joints, actuators = given["actuation"].transmission.shape[-2:]
         rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
-    lanes = Lanes(admit, shared, rows, compact, kernel.tile or LOOSE_TILE, str(structure))
-    out = differentiable(kernel, lanes, arguments)
+    lanes = Lanes(admit, arguments.shared, rows, compact, kernel.tile or LOOSE_TILE, str(arguments.structure))
+    out = differentiable(kernel, lanes, leaves)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
-_CONTACT_LEAVES = ("positions", "frames", "friction", "max_force", "active")
-_PUBLIC = {
-    "wrench": "required_wrench",
-    "reserve": "cone_margin",
-    "per_vertex": "compliance",
-    "weights": "effort_weights",
-}
-
-
 _TRANSMISSION = {"transmission", "inverse", "unreached"}
-
-
-def _argument(name: str, value: Any, event: tuple[int, ...]) -> tuple[jax.Array, tuple[int, ...]]:
-    array = as_float(name, value, event)
-    return array, array.shape[: array.ndim - len(event)]
-
-
-def _compliance(value: Any, n: int) -> tuple[jax.Array, tuple[int, ...]]:
-    array = as_float("compliance", value, ("rows", "columns"))
-    for event in ((n, 3, 3), (3 * n, 3 * n)):
-        if array.shape[-len(event) :] == event:
-            return array, array.shape[: array.ndim - len(event)]
-    raise ValueError(f"compliance: got shape {array.shape}, wanted (*batch, {n}, 3, 3) or (*batch, {3 * n}, {3 * n})")
-
-
-def _per_vertex(compliance: Compliance, disturbances: DisturbanceSet, n: int) -> tuple[jax.Array, tuple[int, ...]]:
-    if len(disturbances.terms) != 1 or not isinstance(disturbances.terms[0], Vertices):
-        raise ValueError(
-            "compliance: got one Q for each direction, wanted a single Q, "
-            "since the disturbance set is not given by vertices; use DisturbanceSet.vertices"
-        )
-    if disturbances.terms[0].width is not None:
-        raise ValueError("compliance: got one Q for each direction, wanted a single Q, since the set is smoothed")
-    array, count = compliance.per_vertex, disturbances.terms[0].wrenches.shape[-2]
-    for event in ((count, n, 3, 3), (count, 3 * n, 3 * n)):
-        if array.shape[-len(event) :] == event:
-            return array, array.shape[: array.ndim - len(event)]
-    raise ValueError(
-        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or "
-        f"(*batch, {count}, {3 * n}, {3 * n}), one Q for each of the {count} wrenches"
-    )
-
-
-def _actuation(actuation: Actuation, n: int) -> dict[str, tuple[jax.Array, tuple[int, ...]]]:
-    if actuation.jacobian.shape[-3] != n:
-        raise ValueError(
-            f"actuation: got a jacobian of shape {actuation.jacobian.shape}, wanted (*batch, {n}, 3, n_v), "
-            f"one for each of the {n} contacts"
-        )
-    trailing = {"jacobian": 3, "transmission": 2, "inverse": 2, "unreached": 2, "lower": 1, "upper": 1}
-    leaves = {name: getattr(actuation, name) for name in trailing}
-    return {name: (x, x.shape[: x.ndim - trailing[name]]) for name, x in leaves.items() if x is not None}
 
 
 def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[jax.Array, ...]) -> Grasps:

@@ -14,6 +14,10 @@ from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.auditing import Audited
+from jaxgrasp.robustness.auditing.problem import Problem
+from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge
+from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
 from jaxgrasp.robustness.derivatives import CentralPoint, Point, central_kappa, centred, envelope_adjoint
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
@@ -109,7 +113,7 @@ def largest_disturbance(
         smoothing=smoothing,
         cutoff=cutoff,
         actuation=actuation,
-    )
+    )[0]
 
 
 def least_effort(
@@ -171,12 +175,12 @@ def least_effort(
         margin=margin,
         smoothing=smoothing,
         actuation=actuation,
-    )
+    )[0]
 
 
 @dataclass(frozen=True)
-class _Tightening(OfPyramids, ABC):
-    """What the kernels of (21) and (22) share."""
+class _Tightening(OfPyramids, Audited, ABC):
+    """What the kernels of (21) and (22) share; their results are a solution and evidence for its audit."""
 
     smooth: bool
 
@@ -185,7 +189,13 @@ class _Tightening(OfPyramids, ABC):
         return (lambda grasps, _: prepared(grasps, self.cone_edges), lambda given: self._solve(*given))
 
     @abstractmethod
-    def _solve(self, grasps: Grasps, program: Program) -> Solution: ...
+    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]: ...
+
+    def judge(self, problem: Problem, out: tuple[Solution, Evidence], turn: jax.Array, stride: int) -> Verdict:
+        return judge(problem, *out, turn, stride, self.smooth)
+
+    def correct(self, out: tuple[Solution, Evidence], verdicts: Verdict) -> tuple[Solution, Evidence]:
+        return corrected(out[0], verdicts), out[1]
 
     def _point(self, out: Solution, usable: jax.Array) -> Point:
         if self.smooth:
@@ -200,34 +210,61 @@ class _Tightening(OfPyramids, ABC):
 
 
 class _LargestDisturbance(_Tightening):
-    def _solve(self, grasps: Grasps, program: Program) -> Solution:
-        return _solve_margin(grasps, program)[0]
+    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]:
+        best, _, iterate = _solve_margin(grasps, program)
+        solution = best
+        if grasps.smoothing is not None:
+            possible = ~(program.wrench_outside | program.disturbance_outside | program.undisturbed)
+            solution = _at_centre(grasps, program, iterate, best, grasps.valid & possible)
+        return solution, _evidence(program, best)
 
-    def tangents(self, along: Along, out: Solution) -> Solution:
+    def tangents(self, along: Along, found: tuple[Solution, Evidence]) -> tuple[Solution, Evidence]:
+        out = found[0]
         point = self._point(out, jnp.isfinite(out.margin) & (out.status != Status.PRUNED))
         change = self._central(along, point)
         if not self.smooth:
             adjoint = partial(envelope_adjoint, self.cone_edges)
             change = change._replace(margin=along.adjoint(adjoint, point, (out.margin,))[0])
-        return _changed(out, change, change.margin)
+        return _changed(found, change, change.margin)
 
 
 class _LeastEffort(_Tightening):
-    def _solve(self, grasps: Grasps, program: Program) -> Solution:
-        return _solve_effort(grasps, program, *_solve_margin(replace(grasps, smoothing=None), program))
+    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]:
+        first, record, _ = _solve_margin(replace(grasps, smoothing=None), program)
+        return _solve_effort(grasps, program, first, record), _evidence(program, first)
 
-    def tangents(self, along: Along, out: Solution) -> Solution:
-        return _changed(out, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)
+    def tangents(self, along: Along, found: tuple[Solution, Evidence]) -> tuple[Solution, Evidence]:
+        out = found[0]
+        return _changed(found, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)
 
 
-def _changed(out: Solution, change: Point, upper_bound: jax.Array | None) -> Solution:
-    """A change of a solution; None for what does not vary, or counts as if it did not."""
+def _changed(found: tuple[Solution, Evidence], change: Point, upper_bound: jax.Array | None) -> tuple:
+    """A change of the results; None for what does not vary, or counts as if it did not."""
     varying = change._asdict() | {"upper_bound": upper_bound}
-    return Solution(**{f.name: varying.get(f.name) for f in fields(out)})
+    still = jax.tree.map(lambda _: None, found[1])
+    return Solution(**{f.name: varying.get(f.name) for f in fields(Solution)}), still
 
 
-def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
-    """(21) for lanes; also the scaled record, from which (22) starts."""
+def _evidence(program: Program, best: Solution) -> Evidence:
+    """What the audit needs beside the answer: the worst rows as they were solved, and what proves (21)'s bound."""
+    unit = program.row_units() / program.scale
+    cone_and_bound = jnp.where(program.undisturbed, 0, program.sigma * unit)
+    effort = None
+    if program.efforts is not None:
+        taken = program.efforts.sigma * (program.efforts.unit / program.scale)
+        effort = jnp.where(program.undisturbed, 0, taken)
+    return Evidence(
+        WorstRows(jnp.moveaxis(cone_and_bound[:-1], 0, 1), cone_and_bound[-1], effort),
+        best.cone_multipliers,
+        best.bound_multipliers,
+        best.wrench_multipliers,
+        best.actuator_multipliers,
+        best.joint_multipliers,
+    )
+
+
+def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, Iterate]:
+    """(21) for lanes; also the scaled record, from which (22) starts, and the last iterate."""
     dtype = program.rhs.dtype
     problem = margin_problem(program, grasps.cutoff)
     settings = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
@@ -291,10 +328,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
         wrench_multipliers=jnp.where(told, program.wrench_multipliers(record.y, grasps.units) * scale, 0),
         **actuated,
     )
-    if grasps.smoothing is None:
-        return solution, record
-    possible = ~(program.wrench_outside | program.disturbance_outside | program.undisturbed)
-    return _at_centre(grasps, program, outcome.iterate, solution, grasps.valid & possible), record
+    return solution, record, outcome.iterate
 
 
 def _unloaded(grasps: Grasps, program: Program) -> jax.Array:

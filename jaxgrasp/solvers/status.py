@@ -16,6 +16,7 @@ class Status(enum.IntEnum):
     ILL_CONDITIONED = 4
     INVALID_INPUT = 5
     PRUNED = 6
+    NOT_VERIFIED = 7
 
     @property
     def advice(self) -> str:
@@ -31,4 +32,5 @@ _ADVICE = {
     Status.ILL_CONDITIONED: "The rank of the grasp map cannot be told in this precision; use float64.",
     Status.INVALID_INPUT: "The data of this element are not admissible (NaN, zero normal, negative friction ...).",
     Status.PRUNED: "Given up early, since its upper bound is below the cutoff; the bounds hold.",
+    Status.NOT_VERIFIED: "The audit could not confirm the answer; its margin is what it confirms, or NaN. Use float64.",
 }

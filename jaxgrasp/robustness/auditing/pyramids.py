@@ -1,0 +1,310 @@
+"""The audit of (21) and (22): what their answers claim, against the public arguments.
+
+Forces f_0, checked against G f_0 = b and the rows, prove a margin from below. Multipliers z >= 0 of the rows and y of
+G f = b prove one from above, whatever they are: for every admissible f with lambda >= 0,
+
+    lambda (z'sigma) <= h'z + b'y - r'f,  r = A'z + G'y,
+
+with rows A f + sigma lambda <= h, and |f_t| <= mu f_max, |f_n| <= f_max bound r'f.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxgrasp.robustness.auditing.problem import Problem, every, facets, lanes_of
+from jaxgrasp.robustness.auditing.rows import Range, Rows, cross, own_rows
+from jaxgrasp.robustness.solution import Solution
+from jaxgrasp.solvers.status import Status
+
+# Shares of the largest force by which rows and G f = b may be missed, and of the margin's natural scale between a bound
+# and its proof. What counts as wrong is the same for rows, and ten times as much for bounds.
+MISSED = {"float64": 1e-7, "float32": 3e-5}
+CLOSED = {"float64": 2e-7, "float32": 2e-4}
+
+
+class Evidence(NamedTuple):
+    """What the solver adds to its answer for the audit; lanes lead.
+
+    rows: S_1 and S_2 as it used them.
+    cone_multipliers, bound_multipliers, wrench_multipliers, actuator_multipliers, joint_multipliers: those of (21) that
+        prove the upper bound, as in `Solution`.
+    """
+
+    rows: Rows
+    cone_multipliers: jax.Array
+    bound_multipliers: jax.Array
+    wrench_multipliers: jax.Array
+    actuator_multipliers: jax.Array | None
+    joint_multipliers: jax.Array | None
+
+
+class Verdict(NamedTuple):
+    """failed: bool (lanes,); margin, upper_bound: (lanes,), what the audit itself confirms, NaN and inf if nothing."""
+
+    failed: jax.Array
+    margin: jax.Array
+    upper_bound: jax.Array
+
+
+def judge(
+    problem: Problem, solution: Solution, evidence: Evidence, turn: jax.Array, stride: int, smooth: bool
+) -> Verdict:
+    """Audit every lane, and one in `stride` with S_1 and S_2 computed anew.
+
+    Args:
+        problem: the public arguments.
+        solution: of (21), or of (22) where the problem asks for a margin; leaves (lanes, ...).
+        evidence: what the solver adds.
+        turn: which lane of every `stride` is computed anew.
+        stride: 1 computes all of them anew.
+        smooth: whether a central point is claimed, which need not be optimal.
+    """
+    edges = solution.cone_multipliers.shape[-1]
+
+    def anew(problem: Problem, solution: Solution, evidence: Evidence) -> Verdict:
+        rows, place = own_rows(problem, edges, solution.rank)
+        return _judged(problem, solution, evidence, rows, place, smooth)
+
+    if stride == 1:
+        return anew(problem, solution, evidence)
+    all_lanes = _judged(problem, solution, evidence, evidence.rows, None, smooth)
+    pick = lambda tree: jax.tree.map(lambda x: every(x, turn, stride), tree)  # noqa: E731
+    some = anew(lanes_of(problem, turn, stride), pick(solution), pick(evidence))
+
+    def merged(coarse: jax.Array, fine: jax.Array) -> jax.Array:
+        blocks = coarse[: fine.shape[0] * stride].reshape(-1, stride)
+        blocks = jnp.where(jnp.arange(stride) == turn, fine[:, None], blocks).reshape(-1)
+        return jnp.concatenate([blocks, coarse[blocks.shape[0] :]])
+
+    return jax.tree.map(merged, all_lanes, some)
+
+
+def corrected(solution: Solution, verdict: Verdict) -> Solution:
+    """The solution with what the audit confirms in place of what it does not."""
+    failed = verdict.failed
+    instead = {
+        "margin": verdict.margin,
+        "upper_bound": verdict.upper_bound,
+        "status": jnp.int32(Status.NOT_VERIFIED),
+        **dict.fromkeys(("forces", "effort", "gap", "actuator_efforts"), jnp.nan),
+        **dict.fromkeys(("cone_multipliers", "bound_multipliers", "wrench_multipliers", "actuator_multipliers"), 0.0),
+        "joint_multipliers": 0.0,
+    }
+
+    def changed(name: str, value: jax.Array) -> jax.Array:
+        mask = failed.reshape(*failed.shape, *[1] * (value.ndim - failed.ndim))
+        return jnp.where(mask, instead[name], value)
+
+    given = {name: getattr(solution, name) for name in instead}
+    return replace(solution, **{name: changed(name, value) for name, value in given.items() if value is not None})
+
+
+def _judged(
+    problem: Problem, solution: Solution, evidence: Evidence, rows: Rows, place: Range | None, smooth: bool
+) -> Verdict:
+    dtype = solution.margin.dtype.name
+    status, asked = solution.status, problem.margin
+    scale = natural_scale(problem, rows)
+    proven = _upper_bound(problem, evidence, rows)
+    proven = jnp.where(_flat(problem, solution, rows, place, proven), 0, proven)
+    proven = jnp.where(rows_size(rows) == 0, jnp.inf, proven)
+    holds, attained, within = _primal(problem, solution, rows)
+    slack = CLOSED[dtype] * jnp.maximum(scale, jnp.abs(jnp.where(jnp.isfinite(attained), attained, 0)))
+
+    margin, upper = solution.margin, solution.upper_bound
+    bounded = proven <= upper + slack
+    solved = holds & within & (margin <= attained) & (margin <= upper) & bounded
+    if asked is not None:
+        solved &= asked <= attained
+    if not smooth:
+        solved &= upper - margin <= slack if asked is None else _least(problem, solution, rows)
+    idle = holds & (attained == jnp.inf) & (margin == jnp.inf)
+    borne = (proven < 0) | jnp.isnan(margin) & _outside(solution, place)
+    if asked is not None:
+        borne |= proven < asked
+    stands = jnp.select(
+        [status == Status.SOLVED, status == Status.UNBOUNDED, status == Status.INFEASIBLE, status == Status.PRUNED],
+        [solved, idle, borne, bounded],
+        True,
+    )
+    confirmed = jnp.where(holds & within & (attained > -jnp.inf), attained, jnp.nan)
+    return Verdict(~stands, confirmed, jnp.where(jnp.isnan(proven), jnp.inf, proven))
+
+
+def natural_scale(problem: Problem, rows: Rows) -> jax.Array:
+    """Lambda (lanes,): the disturbance that by itself takes a whole row, 1 where nothing disturbs."""
+    share = jnp.maximum(problem.friction * problem.max_force, 1e-9 * problem.max_force)
+    largest = jnp.maximum((rows.cone.max(-1) / share).max(-1), (rows.bound / problem.max_force).max(-1))
+    return jnp.where(largest > 0, 1 / jnp.where(largest > 0, largest, 1), 1)
+
+
+def rows_size(rows: Rows) -> jax.Array:
+    """The most that any row loses, (lanes,)."""
+    most = jnp.maximum(rows.cone.max((-2, -1)), rows.bound.max(-1))
+    return most if rows.effort is None else jnp.maximum(most, rows.effort.max((-2, -1)))
+
+
+def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Whether G f_0 = b; the margin that f_0 attains; whether rows that nothing disturbs hold; (lanes,)."""
+    dtype = solution.forces.dtype
+    forces = jnp.where(problem.present[:, :, None], solution.forces, 0)
+    cone, bound = row_values(problem, forces, rows.cone.shape[-1])
+    attained, sound = jnp.full(forces.shape[:1], jnp.inf, dtype), jnp.ones(forces.shape[:1], bool)
+    unit = problem.max_force * problem.present
+    limits = [(-problem.reserve[:, None, None] - cone, rows.cone, unit[:, :, None])]
+    limits += [(problem.max_force - bound, rows.bound, unit)]
+    holds = balanced(problem, forces)
+    if problem.hand is not None:
+        efforts, unit = solution.actuator_efforts, effort_unit(problem)
+        upper, lower = problem.hand.upper - efforts, efforts - problem.hand.lower
+        limits += [(jnp.stack([upper, lower], 1), rows.effort, unit[:, None])]
+        holds &= _driven(problem, forces, efforts)
+    for left, loss, unit in limits:
+        axes = tuple(range(1, left.ndim))
+        left = left + MISSED[dtype.name] * unit
+        moved = (loss > 0) & (unit > 0)
+        attained = jnp.minimum(attained, jnp.where(moved, left / jnp.where(moved, loss, 1), jnp.inf).min(axes))
+        sound &= ((left >= 0) | moved | (unit == 0)).all(axes)
+    return holds, attained, sound
+
+
+def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[jax.Array, jax.Array]:
+    """C f (lanes, n, n_e) and -f_n (lanes, n)."""
+    pressed = jnp.stack([forces[..., 0], forces[..., 1], problem.friction * forces[..., 2]], -1)
+    cone = jnp.einsum("...a,ka->...k", pressed, facets(cone_edges, forces.dtype), precision="highest")
+    return cone, -forces[..., 2]
+
+
+def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = None) -> jax.Array:
+    """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size; (lanes,)."""
+    f, frames = forces, problem.frames
+    pushes = frames[..., 0] * f[..., :1] + frames[..., 1] * f[..., 1:2] + frames[..., 2] * f[..., 2:]
+    size = problem.size[:, None]
+    wanted = problem.wrench if wrench is None else wrench
+    missing = jnp.concatenate(
+        [
+            pushes.sum(1) - wanted[:, :3],
+            (cross(problem.positions, pushes, -1).sum(1) - wanted[:, 3:]) / size,
+        ],
+        -1,
+    )
+    largest = jnp.maximum(jnp.abs(wanted[:, :3]).max(-1), jnp.abs(wanted[:, 3:] / size).max(-1))
+    largest = jnp.maximum(largest, jnp.sqrt((f * f).sum(-1)).sum(-1))
+    return jnp.abs(missing).max(-1) <= MISSED[f.dtype.name] * largest
+
+
+def effort_unit(problem: Problem) -> jax.Array:
+    """The larger limit of every actuator, (lanes, n_u)."""
+    return jnp.maximum(jnp.abs(problem.hand.upper), jnp.abs(problem.hand.lower))
+
+
+def _driven(problem: Problem, forces: jax.Array, efforts: jax.Array) -> jax.Array:
+    """Whether J'f = B u, (lanes,)."""
+    hand = problem.hand
+    given = jnp.einsum("liav,lia->lv", hand.jacobian, forces, precision="highest")
+    taken = jnp.einsum("...vu,...u->...v", hand.transmission, efforts, precision="highest")
+    largest = jnp.einsum("liav,lia->lv", jnp.abs(hand.jacobian), jnp.abs(forces)).max(-1)
+    largest = jnp.maximum(largest, jnp.einsum("...vu,...u->...v", jnp.abs(hand.transmission), jnp.abs(efforts)).max(-1))
+    return jnp.abs(given - taken).max(-1) <= MISSED[forces.dtype.name] * largest
+
+
+def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> jax.Array:
+    """A'z + G'y, (lanes, n, 3)."""
+    pull = jnp.einsum("...k,ka->...a", cone, facets(cone.shape[-1], cone.dtype), precision="highest")
+    turned = y[:, None, :3] + cross(jnp.broadcast_to(y[:, None, 3:], problem.positions.shape), problem.positions, -1)
+    frames = problem.frames
+    along = frames[:, :, 0] * turned[..., :1] + frames[:, :, 1] * turned[..., 1:2] + frames[:, :, 2] * turned[..., 2:]
+    normal = pull[..., 2] * problem.friction - bound
+    return jnp.stack([pull[..., 0], pull[..., 1], normal], -1) + along
+
+
+def _lost(problem: Problem, residual: jax.Array) -> jax.Array:
+    """The most that r'f can be for admissible forces, (lanes,)."""
+    residual = jnp.abs(residual)
+    tangential = (residual[..., 0] + residual[..., 1]) * problem.friction
+    return jnp.where(problem.present, (tangential + residual[..., 2]) * problem.max_force, 0).sum(-1)
+
+
+def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> jax.Array:
+    """What the multipliers prove, (lanes,); inf where nothing."""
+    there = problem.present
+    cone = jnp.where(there[:, :, None], jnp.maximum(evidence.cone_multipliers, 0), 0)
+    bound = jnp.where(there, jnp.maximum(evidence.bound_multipliers, 0), 0)
+    residual = _pulled(problem, cone, bound, evidence.wrench_multipliers)
+    pull = (cone * rows.cone).sum((-2, -1)) + (bound * rows.bound).sum(-1)
+    value = (bound * problem.max_force).sum(-1) - problem.reserve * cone.sum((-2, -1))
+    value = value + (problem.wrench * evidence.wrench_multipliers).sum(-1)
+    if problem.hand is not None:
+        more, held, spent = _of_efforts(problem, evidence, rows)
+        residual, pull, value = residual + more, pull + held[0], value + held[1] + spent
+    value = value + _lost(problem, residual)
+    return jnp.where(pull > 0, value / jnp.where(pull > 0, pull, 1), jnp.inf)
+
+
+def _of_efforts(problem: Problem, evidence: Evidence | Solution, rows: Rows) -> tuple:
+    """What the multipliers of actuators and joints add: to r, (to z'sigma, to h'z), and the most that r_u'u can be."""
+    hand = problem.hand
+    z = jnp.maximum(evidence.actuator_multipliers, 0)
+    more = jnp.einsum("liav,lv->lia", hand.jacobian, evidence.joint_multipliers, precision="highest")
+    left = jnp.einsum("...vu,...v->...u", hand.transmission, evidence.joint_multipliers, precision="highest")
+    residual = z[..., 0] - z[..., 1] - left
+    pull = (z[..., 0] * rows.effort[:, 0] + z[..., 1] * rows.effort[:, 1]).sum(-1)
+    value = (z[..., 0] * hand.upper - z[..., 1] * hand.lower).sum(-1)
+    return more, (pull, value), (jnp.abs(residual) * effort_unit(problem)).sum(-1)
+
+
+def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None, proven: jax.Array) -> jax.Array:
+    """Where the margin cannot be positive: a contact without friction has to slip, or wrenches lie outside the range.
+
+    Without S_1 and S_2 of its own the audit takes the solver's word for the latter, where the rank allows it.
+    """
+    slips = ((problem.friction <= 0) & problem.present & (rows.cone.max(-1) > 1e-9 * rows_size(rows)[:, None])).any(-1)
+    claimed = (solution.upper_bound == 0) & jnp.isinf(proven)
+    outside = claimed & (solution.rank < 6) if place is None else place.disturbance_outside & place.rank_stands
+    return slips | outside
+
+
+def _outside(solution: Solution, place: Range | None) -> jax.Array:
+    """Where b lies outside the range of G."""
+    return solution.rank < 6 if place is None else place.wrench_outside & place.rank_stands
+
+
+def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
+    """Whether no forces need less effort, by the multipliers of (22), (lanes,).
+
+    1/2 f'Q_0 f >= -1/2 r'Q_0^-1 r - h'z - b'y with r = A'z + G'y, for all admissible f.
+    """
+    dtype, there = solution.forces.dtype.name, problem.present
+    forces = jnp.where(there[:, :, None], solution.forces, 0)
+    cone = jnp.where(there[:, :, None], jnp.maximum(solution.cone_multipliers, 0), 0)
+    bound = jnp.where(there, jnp.maximum(solution.bound_multipliers, 0), 0)
+    asked = problem.margin
+    held = (bound * (problem.max_force - rows.bound * asked[:, None])).sum(-1)
+    held -= (cone * (problem.reserve[:, None, None] + rows.cone * asked[:, None, None])).sum((-2, -1))
+    residual = jnp.where(there[:, :, None], _pulled(problem, cone, bound, solution.wrench_multipliers), 0)
+    if problem.hand is not None:
+        more, (pull, value), spent = _of_efforts(problem, solution, rows)
+        residual = residual + jnp.where(there[:, :, None], more, 0)
+        held += value + spent - pull * asked
+    held += (problem.wrench * solution.wrench_multipliers).sum(-1)
+    if problem.weights is None:
+        largest, weighed, answered = 1.0, forces, residual
+    else:
+        weights = jnp.where(there[:, :, None, None], problem.weights, jnp.eye(3, dtype=forces.dtype))
+        largest = jnp.abs(weights).max((-2, -1))
+        weighed, answered = jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
+    effort = 0.5 * (forces * weighed).sum((-2, -1))
+    lower = -0.5 * (residual * answered).sum((-2, -1)) - held
+    unit = jnp.where(there, largest * problem.max_force**2, 0).max(-1)
+    near = CLOSED[dtype] * jnp.maximum(effort, 1e-3 * unit)
+    return (effort - lower <= near) & (jnp.abs(effort - solution.effort) <= near)
+
+
+def _divided(vectors: jax.Array, matrices: jax.Array) -> jax.Array:
+    """Q^-1 v for blocks (..., 3, 3), by their adjugates."""
+    a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
+    adjugate = jnp.stack([cross(b, c, -1), cross(c, a, -1), cross(a, b, -1)], -1)
+    return jnp.einsum("...ab,...b->...a", adjugate, vectors) / (a * adjugate[..., 0]).sum(-1)[..., None]

@@ -1,0 +1,73 @@
+"""How answers are audited, and what follows when one of them fails."""
+
+import contextlib
+import contextvars
+import itertools
+import os
+import warnings
+from collections.abc import Iterator
+
+from jaxgrasp import kernels
+
+SETTING = "JAXGRASP_AUDIT"
+FORMS = ("sampled", "strict", "off")
+# The default form recomputes S_1 and S_2 for one lane in this many, another one at every call.
+STRIDE = 16
+
+_form: contextvars.ContextVar[str | None] = contextvars.ContextVar("form", default=None)
+_turns = itertools.count()
+_warned = False
+
+
+@contextlib.contextmanager
+def audit(form: str) -> Iterator[None]:
+    """Choose how the answers of (21), (22), the chain and (11) are audited inside a `with` block.
+
+    Every form but "off" checks each answer against the public arguments in plain XLA code: G f = b, the cone and bound
+    rows at the claimed margin, the upper bound by its multipliers, and lower <= upper. An answer that does not pass
+    gets `Status.NOT_VERIFIED`. Inside a function of your own under `jax.jit` the form counts that is chosen while it is
+    traced. The environment variable JAXGRASP_AUDIT chooses for the whole process.
+
+    Args:
+        form: "sampled", the default: every lane with the S_1 and S_2 that its solver used, and one lane in sixteen,
+            other ones at each call, with S_1 and S_2 computed anew; "strict": every lane with S_1 and S_2 computed
+            anew; "off": no audit.
+
+    Raises:
+        ValueError: another form.
+    """
+    token = _form.set(_known("form", form))
+    try:
+        yield
+    finally:
+        _form.reset(token)
+
+
+def chosen_form() -> str:
+    """The form that counts now."""
+    return _form.get() or _known(SETTING, os.environ.get(SETTING, FORMS[0]))
+
+
+def next_turn() -> int:
+    """Which lane of every `STRIDE` is recomputed this time."""
+    return next(_turns) % STRIDE
+
+
+def report(failed: int, lanes: int) -> None:
+    """Warn, once a process, that answers failed, and have XLA run whatever is traced from now on."""
+    global _warned
+    kernels.distrust()
+    if not _warned:
+        _warned = True
+        warnings.warn(
+            f"{failed} of {lanes} answers failed the audit and have Status.NOT_VERIFIED; what is traced from now on "
+            "runs on XLA in place of native kernels",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+
+
+def _known(name: str, form: str) -> str:
+    if form not in FORMS:
+        raise ValueError(f"{name}: got {form!r}, wanted {', '.join(FORMS[:-1])} or {FORMS[-1]}")
+    return form
