@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.auditing.problem import Problem, every, facets, lanes_of
 from jaxgrasp.robustness.auditing.rows import Range, Rows, cross, own_rows
 from jaxgrasp.robustness.solution import Solution
@@ -111,12 +112,12 @@ def _judged(
     proven = _upper_bound(problem, evidence, rows)
     proven = jnp.where(_flat(problem, solution, rows, place, proven), 0, proven)
     proven = jnp.where(rows_size(rows) == 0, jnp.inf, proven)
-    holds, attained, within = _primal(problem, solution, rows)
+    holds, attained = _primal(problem, solution, rows)
     slack = CLOSED[dtype] * jnp.maximum(scale, jnp.abs(jnp.where(jnp.isfinite(attained), attained, 0)))
 
     margin, upper = solution.margin, solution.upper_bound
     bounded = proven <= upper + slack
-    solved = holds & within & (margin <= attained) & (margin <= upper) & bounded
+    solved = holds & (margin <= attained) & (margin <= upper) & bounded
     if asked is not None:
         solved &= asked <= attained
     if not smooth:
@@ -130,7 +131,7 @@ def _judged(
         [solved, idle, borne, bounded],
         True,
     )
-    confirmed = jnp.where(holds & within & (attained > -jnp.inf), attained, jnp.nan)
+    confirmed = jnp.where(holds & (attained > -jnp.inf), attained, jnp.nan)
     return Verdict(~stands, confirmed, jnp.where(jnp.isnan(proven), jnp.inf, proven))
 
 
@@ -147,28 +148,29 @@ def rows_size(rows: Rows) -> jax.Array:
     return most if rows.effort is None else jnp.maximum(most, rows.effort.max((-2, -1)))
 
 
-def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Whether G f_0 = b; the margin that f_0 attains; whether rows that nothing disturbs hold; (lanes,)."""
-    dtype = solution.forces.dtype
-    forces = jnp.where(problem.present[:, :, None], solution.forces, 0)
+def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array, jax.Array]:
+    """Whether G f_0 = b, and the margin that f_0 attains, -inf where a row fails that nothing disturbs; (lanes,)."""
+    forces, missed = solution.forces, MISSED[solution.forces.dtype.name]
+    there = problem.present
     cone, bound = row_values(problem, forces, rows.cone.shape[-1])
-    attained, sound = jnp.full(forces.shape[:1], jnp.inf, dtype), jnp.ones(forces.shape[:1], bool)
-    unit = problem.max_force * problem.present
-    limits = [(-problem.reserve[:, None, None] - cone, rows.cone, unit[:, :, None])]
-    limits += [(problem.max_force - bound, rows.bound, unit)]
+    slack = missed * problem.max_force
+    spare = (slack - problem.reserve[:, None])[:, :, None] - cone
+    parts = [_most(jnp.where(there[:, :, None], spare, jnp.inf), rows.cone)]
+    parts += [_most(jnp.where(there, problem.max_force + slack - bound, jnp.inf), rows.bound)]
     holds = balanced(problem, forces)
     if problem.hand is not None:
-        efforts, unit = solution.actuator_efforts, effort_unit(problem)
-        upper, lower = problem.hand.upper - efforts, efforts - problem.hand.lower
-        limits += [(jnp.stack([upper, lower], 1), rows.effort, unit[:, None])]
+        efforts, slack = solution.actuator_efforts, missed * effort_unit(problem)
+        spare = jnp.stack([problem.hand.upper + slack - efforts, efforts - problem.hand.lower + slack], 1)
+        parts += [_most(spare, rows.effort)]
         holds &= _driven(problem, forces, efforts)
-    for left, loss, unit in limits:
-        axes = tuple(range(1, left.ndim))
-        left = left + MISSED[dtype.name] * unit
-        moved = (loss > 0) & (unit > 0)
-        attained = jnp.minimum(attained, jnp.where(moved, left / jnp.where(moved, loss, 1), jnp.inf).min(axes))
-        sound &= ((left >= 0) | moved | (unit == 0)).all(axes)
-    return holds, attained, sound
+    return holds, fold(jnp.minimum, parts)
+
+
+def _most(spare: jax.Array, loss: jax.Array) -> jax.Array:
+    """The largest lambda with lambda loss <= spare in every row, (lanes,)."""
+    moved = loss > 0
+    still = jnp.where(spare >= 0, jnp.inf, -jnp.inf)
+    return jnp.where(moved, spare / jnp.where(moved, loss, 1), still).min(tuple(range(1, loss.ndim)))
 
 
 def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[jax.Array, jax.Array]:
@@ -211,43 +213,45 @@ def _driven(problem: Problem, forces: jax.Array, efforts: jax.Array) -> jax.Arra
     return jnp.abs(given - taken).max(-1) <= MISSED[forces.dtype.name] * largest
 
 
-def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> jax.Array:
-    """A'z + G'y, (lanes, n, 3)."""
-    pull = jnp.einsum("...k,ka->...a", cone, facets(cone.shape[-1], cone.dtype), precision="highest")
+def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A'z + G'y, (lanes, n, 3), and the sum of the cone rows' multipliers of every contact, (lanes, n)."""
+    patterns = facets(cone.shape[-1], cone.dtype)
+    patterns = jnp.concatenate([patterns, jnp.ones_like(patterns[:, :1])], 1)
+    pull = jnp.einsum("...k,ka->...a", cone, patterns, precision="highest")
     turned = y[:, None, :3] + cross(jnp.broadcast_to(y[:, None, 3:], problem.positions.shape), problem.positions, -1)
     frames = problem.frames
     along = frames[:, :, 0] * turned[..., :1] + frames[:, :, 1] * turned[..., 1:2] + frames[:, :, 2] * turned[..., 2:]
     normal = pull[..., 2] * problem.friction - bound
-    return jnp.stack([pull[..., 0], pull[..., 1], normal], -1) + along
+    return jnp.stack([pull[..., 0], pull[..., 1], normal], -1) + along, pull[..., 3]
 
 
 def _lost(problem: Problem, residual: jax.Array) -> jax.Array:
-    """The most that r'f can be for admissible forces, (lanes,)."""
+    """The most that r'f can be for the admissible forces of every contact, (lanes, n)."""
     residual = jnp.abs(residual)
     tangential = (residual[..., 0] + residual[..., 1]) * problem.friction
-    return jnp.where(problem.present, (tangential + residual[..., 2]) * problem.max_force, 0).sum(-1)
+    return (tangential + residual[..., 2]) * problem.max_force
 
 
 def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> jax.Array:
     """What the multipliers prove, (lanes,); inf where nothing."""
-    there = problem.present
-    cone = jnp.where(there[:, :, None], jnp.maximum(evidence.cone_multipliers, 0), 0)
-    bound = jnp.where(there, jnp.maximum(evidence.bound_multipliers, 0), 0)
-    residual = _pulled(problem, cone, bound, evidence.wrench_multipliers)
+    cone, bound, y = evidence.cone_multipliers, evidence.bound_multipliers, evidence.wrench_multipliers
+    residual, total = _pulled(problem, cone, bound, y)
     pull = (cone * rows.cone).sum((-2, -1)) + (bound * rows.bound).sum(-1)
-    value = (bound * problem.max_force).sum(-1) - problem.reserve * cone.sum((-2, -1))
-    value = value + (problem.wrench * evidence.wrench_multipliers).sum(-1)
+    sound = (cone.min((-2, -1)) >= 0) & (bound.min(-1) >= 0)
+    value, more = (problem.wrench * y).sum(-1), 0.0
     if problem.hand is not None:
         more, held, spent = _of_efforts(problem, evidence, rows)
-        residual, pull, value = residual + more, pull + held[0], value + held[1] + spent
-    value = value + _lost(problem, residual)
-    return jnp.where(pull > 0, value / jnp.where(pull > 0, pull, 1), jnp.inf)
+        pull, value = pull + held[0], value + held[1] + spent
+        sound &= evidence.actuator_multipliers.min((-2, -1)) >= 0
+    each = bound * problem.max_force - total * problem.reserve[:, None] + _lost(problem, residual + more)
+    value = value + jnp.where(problem.present, each, 0).sum(-1)
+    return jnp.where(sound & (pull > 0), value / jnp.where(pull > 0, pull, 1), jnp.inf)
 
 
 def _of_efforts(problem: Problem, evidence: Evidence | Solution, rows: Rows) -> tuple:
     """What the multipliers of actuators and joints add: to r, (to z'sigma, to h'z), and the most that r_u'u can be."""
     hand = problem.hand
-    z = jnp.maximum(evidence.actuator_multipliers, 0)
+    z = evidence.actuator_multipliers
     more = jnp.einsum("liav,lv->lia", hand.jacobian, evidence.joint_multipliers, precision="highest")
     left = jnp.einsum("...vu,...v->...u", hand.transmission, evidence.joint_multipliers, precision="highest")
     residual = z[..., 0] - z[..., 1] - left
@@ -277,19 +281,18 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
 
     1/2 f'Q_0 f >= -1/2 r'Q_0^-1 r - h'z - b'y with r = A'z + G'y, for all admissible f.
     """
-    dtype, there = solution.forces.dtype.name, problem.present
-    forces = jnp.where(there[:, :, None], solution.forces, 0)
-    cone = jnp.where(there[:, :, None], jnp.maximum(solution.cone_multipliers, 0), 0)
-    bound = jnp.where(there, jnp.maximum(solution.bound_multipliers, 0), 0)
-    asked = problem.margin
-    held = (bound * (problem.max_force - rows.bound * asked[:, None])).sum(-1)
-    held -= (cone * (problem.reserve[:, None, None] + rows.cone * asked[:, None, None])).sum((-2, -1))
-    residual = jnp.where(there[:, :, None], _pulled(problem, cone, bound, solution.wrench_multipliers), 0)
+    dtype, there, forces, asked = solution.forces.dtype.name, problem.present, solution.forces, problem.margin
+    cone, bound, y = solution.cone_multipliers, solution.bound_multipliers, solution.wrench_multipliers
+    sound = (cone.min((-2, -1)) >= 0) & (bound.min(-1) >= 0)
+    residual, total = _pulled(problem, cone, bound, y)
+    held = bound * problem.max_force - total * problem.reserve[:, None]
+    held = jnp.where(there, held, 0).sum(-1) + (problem.wrench * y).sum(-1)
+    held -= asked * ((cone * rows.cone).sum((-2, -1)) + (bound * rows.bound).sum(-1))
     if problem.hand is not None:
         more, (pull, value), spent = _of_efforts(problem, solution, rows)
-        residual = residual + jnp.where(there[:, :, None], more, 0)
-        held += value + spent - pull * asked
-    held += (problem.wrench * solution.wrench_multipliers).sum(-1)
+        residual, held = residual + more, held + value + spent - pull * asked
+        sound &= solution.actuator_multipliers.min((-2, -1)) >= 0
+    residual = jnp.where(there[:, :, None], residual, 0)
     if problem.weights is None:
         largest, weighed, answered = 1.0, forces, residual
     else:
@@ -300,7 +303,7 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     lower = -0.5 * (residual * answered).sum((-2, -1)) - held
     unit = jnp.where(there, largest * problem.max_force**2, 0).max(-1)
     near = CLOSED[dtype] * jnp.maximum(effort, 1e-3 * unit)
-    return (effort - lower <= near) & (jnp.abs(effort - solution.effort) <= near)
+    return sound & (effort - lower <= near) & (jnp.abs(effort - solution.effort) <= near)
 
 
 def _divided(vectors: jax.Array, matrices: jax.Array) -> jax.Array:

@@ -7,6 +7,7 @@ divided by the grasp's size) are made orthonormal by Gram-Schmidt with row pivot
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -102,32 +103,35 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
         rows: N.
         rank: (lanes,), how many rows to keep; None keeps what is longer than the solver's tolerance.
     """
-    count, dtype = rows.shape[0], rows.dtype
-    squares = lambda x: (x * x).sum(-2)  # noqa: E731
-    longest = jnp.sqrt(squares(rows).max(0))
+    count, width, lanes = rows.shape
+    dtype = rows.dtype
+    product = partial(jnp.einsum, precision="highest")
+    squares = lambda x: product("...k,...k->...", x[..., :width], x[..., :width])  # noqa: E731
+    # The rows and, beside them, the row operations that led to them: small products are fast with lanes leading.
+    eye = jnp.broadcast_to(jnp.eye(count, dtype=dtype), (lanes, count, count))
+    rows = jnp.concatenate([jnp.moveaxis(rows, -1, 0), eye], 2)
+    longest = jnp.sqrt(squares(rows).max(1))
     least, most = (share * longest for share in _DOUBTFUL[dtype.name])
-    eye = jnp.broadcast_to(jnp.eye(count, dtype=dtype)[:, :, None], (count, count, rows.shape[-1]))
-    nothing = jnp.zeros_like(rows), jnp.zeros_like(eye)
 
     def step(j: jax.Array, state: tuple) -> tuple:
-        rows, made, basis, null, left, stands = state
-        pivot = jnp.argmax(jnp.where(left, squares(rows), -1), 0) == jnp.arange(count)[:, None]
-        row, how = ((x * pivot[:, None]).sum(0) for x in (rows, made))
-        again = (basis[0] * row).sum(1)[:, None]
-        row, how = row - (again * basis[0]).sum(0), how - (again * basis[1]).sum(0)
+        rows, basis, null, left, stands = state
+        pivot = jnp.argmax(jnp.where(left, squares(rows), -1), 1)[:, None] == jnp.arange(count)
+        row = product("lr,lrk->lk", pivot.astype(dtype), rows)
+        again = product("lrk,lk->lr", basis[..., :width], row[:, :width])
+        row = row - product("lr,lrk->lk", again, basis)
         length = jnp.sqrt(squares(row))
         kept = length > RANK_TOLERANCE[dtype.name] * longest if rank is None else j < rank
         stands &= jnp.where(kept, length > least, length < most)
-        inverse = jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)
-        unit, unit_how = row * inverse, how * inverse
-        share = (rows * unit).sum(1)[:, None]
-        basis = basis[0].at[j].set(unit), basis[1].at[j].set(unit_how)
-        null = null.at[j].set(jnp.where(kept, 0, how))
-        return rows - share * unit, made - share * unit_how, basis, null, left & ~pivot, stands
+        unit = row * jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)[:, None]
+        share = product("lrk,lk->lr", rows[..., :width], unit[:, :width])
+        basis = lax.dynamic_update_index_in_dim(basis, unit[:, None], j, 1)
+        null = lax.dynamic_update_index_in_dim(null, jnp.where(kept[:, None], 0, row[:, width:])[:, None], j, 1)
+        return rows - share[:, :, None] * unit[:, None], basis, null, left & ~pivot, stands
 
-    start = (rows, eye, nothing, eye * 0, jnp.ones(rows.shape[::2], bool), jnp.ones(rows.shape[-1:], bool))
-    _, _, basis, null, _, stands = lax.fori_loop(0, count, step, start)
-    return Echelon(jnp.einsum("jkl,jrl->krl", *basis), null, stands | (rank is None))
+    start = rows, jnp.zeros_like(rows), jnp.zeros_like(eye), jnp.ones((lanes, count), bool), jnp.ones(lanes, bool)
+    _, basis, null, _, stands = lax.fori_loop(0, count, step, start)
+    inverse = product("ljk,ljr->krl", basis[..., :width], basis[..., width:])
+    return Echelon(inverse, jnp.moveaxis(null, 0, -1), stands | (rank is None))
 
 
 def _weighted(
