@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-
 SETTING = "JAXGRASP_VECTOR_BITS"
 # What narrower vectors than the processor's are made without.
 _WITHOUT = {128: ",-avx2", 256: ",-avx512f", 512: ""}

@@ -319,7 +319,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, I
         effort=jnp.where(answered, effort_of(forces, None), jnp.nan),
         status=status,
         iterations=outcome.iterations,
-        primal_residual=problem.violations(record.x, low),
+        primal_residual=jnp.where(answered, problem.violations(record.x, low), jnp.nan),
         dual_residual=_largest(outcome.residuals.dual[0]),
         gap=jnp.where(answered, (high - low) / size, jnp.nan),
         rank=program.rank,

@@ -179,7 +179,9 @@ def reaches_outside(grasps: Grasps, basis: Basis) -> jax.Array:
         size = sum(fold(jnp.maximum, extent * grasps.units) for extent in grasps.extents)
         dropped = jnp.where(basis.kept[:, None] > 0, 0, basis.operations[:, :6])
         outside = jnp.moveaxis(dropped, 0, 1) * grasps.units[:, None]
-        reach = support(grasps.terms, jnp.concatenate([outside, -outside], 1))
+        # The set itself: what smoothing adds would be outside, too, even for directions that are zero.
+        terms = tuple(replace(term, width=None) for term in grasps.terms)
+        reach = support(terms, jnp.concatenate([outside, -outside], 1))
         return fold(jnp.maximum, reach) > tolerance * size
 
     return lax.cond(jnp.all(basis.kept > 0), lambda: jnp.zeros(lanes, bool), measure)
