@@ -1,12 +1,12 @@
 """Whether answers are true: random and degenerate lanes, each checked in NumPy that shares nothing with the package.
 
-    python -m benchmarks.truth --dtype float64 --lanes 4000000 [--families plain loads] [--seed 1] [--record truth.jsonl]
+    python -m benchmarks.truth --dtype float64 --lanes 4000000 [--families loads ...] [--seed 1] [--record truth.jsonl]
 
-The lanes are of the 27 families of `suite/families.py`, one in eight spoilt. Every batch is solved twice, with and without
-the spoilt lanes, by `largest_disturbance` and by `least_effort` at shares of the margin found (shares above one
+The lanes are of the 27 families of `suite/families.py`, one in eight spoilt. Every batch is solved twice, with and
+without the spoilt lanes, by `largest_disturbance` and by `least_effort` at shares of the margin found (shares above one
 included). Rules are in `suite/rules.py`; lanes that their own forces and multipliers do not settle, and a random sample
-of the others, go to HiGHS. With --record every batch becomes a line of that file; batches that it has are not run again,
-and the report, truth.md beside this file, is of all its lines.
+of the others, go to HiGHS. With --record every batch becomes a line of that file; batches that it has are not run
+again, and the report, truth.md beside this file, is of all its lines.
 """
 
 from __future__ import annotations
