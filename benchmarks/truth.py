@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.suite import families, highs, lanes, rules
 from benchmarks.suite.lanes import Claims, Lanes
+from benchmarks.suite.rows import TOLERANCES, model
 from benchmarks.suite.truth_report import faults, report, told
 
 BATCH, CHUNK = 16_384, 4_096
@@ -41,14 +42,12 @@ def asked_of(margins: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return share * np.where(np.isfinite(margins), np.maximum(margins, 0), 1).astype(margins.dtype)
 
 
-def examine(
-    name: str, dtype: str, seed: tuple[int, ...], count: int, sample: int = 0, batch: Lanes | None = None
-) -> dict:
+def examine(name: str, dtype: str, seed: tuple[int, ...], count: int, sample: int = 0) -> dict:
     """Solve one batch of a family, check it and count what was found."""
     rng = np.random.default_rng([7919, *seed])
-    clean = (families.make(name, count, seed) if batch is None else batch).rounded(dtype)
-    spoilt_lanes, spoilt = lanes.spoil(clean, rng)
     clock = [time.perf_counter()]
+    clean = families.make(name, count, seed).rounded(dtype)
+    spoilt_lanes, spoilt = lanes.spoil(clean, rng)
     alone = lanes.largest_disturbance(clean)
     asked = asked_of(alone.margin, rng)
     answers = {"margin": lanes.largest_disturbance(spoilt_lanes), "effort": lanes.least_effort(spoilt_lanes, asked)}
@@ -85,29 +84,29 @@ def examine(
 
 def check(clean: Lanes, answers: dict[str, Claims], asked: np.ndarray, dtype: str) -> dict:
     """The findings of both programs, and the model, of sound lanes."""
-    tolerances = rules.TOLERANCES[dtype]
+    tolerances = TOLERANCES[dtype]
     claims = {program: answer.wide() for program, answer in answers.items()}
     # What nobody uses may be anything, and so may what is beyond float64.
     with np.errstate(all="ignore"):
-        model = rules.model(clean, answers["margin"].rank, tolerances)
-        margin, known = rules.margins(model, claims["margin"], tolerances)
-        effort = rules.efforts(model, claims["effort"], asked.astype(np.float64), known, tolerances)
-    return {"model": model, "margin": margin, "effort": effort}
+        m = model(clean, answers["margin"].rank, tolerances)
+        margin, optimum = rules.margins(m, claims["margin"], tolerances)
+        effort = rules.efforts(m, claims["effort"], asked.astype(np.float64), optimum, tolerances)
+    return {"model": m, "margin": margin, "effort": effort}
 
 
 def ask_highs(found: dict, claims: Claims, dtype: str, rng: np.random.Generator, sample: int) -> Counter:
     """HiGHS settles what is open, and a random sample: sets `value` and `false_status` of the margins' findings."""
-    model, margin = found["model"], found["margin"]
-    told = (margin.solved | (claims.status == rules.INFEASIBLE)) & ~model.doubtful
+    m, margin = found["model"], found["margin"]
+    told = (margin.solved | (claims.status == rules.INFEASIBLE)) & ~m.doubtful
     unsettled, settled = np.flatnonzero(margin.open), np.flatnonzero(told & ~margin.open)
     drawn = rng.choice(settled, min(sample, len(settled)), replace=False)
     chosen = np.concatenate([unsettled[:MOST_HIGHS], drawn])
     if not len(chosen):
         return Counter()
     with np.errstate(all="ignore"):
-        optimum, unknown = highs.optima(model[chosen])
+        optimum, unknown = highs.optima(m[chosen])
         own = claims[chosen].wide()
-        unit = rules.TOLERANCES[dtype].margin * model[chosen].mean_force
+        unit = TOLERANCES[dtype].margin * m[chosen].mean_force
         off = np.maximum(np.abs(own.margin - optimum), np.abs(own.upper_bound - optimum))
     margin.value[chosen] |= margin.solved[chosen] & ~unknown & ~(off <= unit)
     margin.false_status[chosen] |= (own.status == rules.INFEASIBLE) & ~unknown & (optimum > unit)
@@ -137,7 +136,7 @@ def tally(found: dict, rows: np.ndarray, counts: Counter, examples: list) -> Non
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--dtype", choices=list(rules.TOLERANCES), default="float64")
+    parser.add_argument("--dtype", choices=list(TOLERANCES), default="float64")
     parser.add_argument("--lanes", type=int, default=4_000_000, help="of all families together")
     parser.add_argument("--families", nargs="+", default=list(families.FAMILIES), choices=list(families.FAMILIES))
     parser.add_argument("--seed", type=int, default=0)

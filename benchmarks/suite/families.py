@@ -79,7 +79,7 @@ def size_of(lanes: Lanes) -> np.ndarray:
 def wrench_of(lanes: Lanes, forces: np.ndarray) -> np.ndarray:
     """(lanes, ..., 6): G f of forces (lanes, ..., n_c, 3) in contact frames."""
     turned = np.einsum("lcij,l...cj->l...ci", lanes.frames, forces)
-    arms = lanes.positions.reshape(len(lanes), *[1] * (forces.ndim - 3), -1, 3)
+    arms = np.expand_dims(lanes.positions, tuple(range(1, forces.ndim - 2)))
     return np.concatenate([turned.sum(-2), np.cross(arms, turned).sum(-2)], axis=-1)
 
 
@@ -88,19 +88,16 @@ def with_vertices(rng: Generator, lanes: Lanes, kinds=(0, 1, 2, 3, 4)) -> Lanes:
     count, size = len(lanes), size_of(lanes)[:, None]
     scale = np.concatenate([np.ones((count, 1, 3)), np.broadcast_to(size, (count, 1, 3))], axis=-1)
     axes = np.vstack([np.eye(6), -np.eye(6)])
-    reached = wrench_of(lanes, rng.normal(size=(count, DIRECTIONS, *lanes.active.shape[1:], 3)))
-    reached /= np.maximum(np.abs(reached / scale).max((1, 2), keepdims=True), 1e-300)
-    wrenches = np.concatenate([units(rng, count, DIRECTIONS), units(rng, count, DIRECTIONS)], axis=-1)
-    choices = np.stack(
-        [
-            np.broadcast_to(axes * np.repeat([1, 0], 3), (count, DIRECTIONS, 6)),
-            axes * scale,
-            wrenches * scale,
-            axes * scale * np.repeat([0, 1], 3),
-            reached,
-        ]
-    )
-    return replace(lanes, vertices=choices[rng.choice(kinds, count), np.arange(count)])
+    kind = rng.choice(kinds, count)
+    parts = np.array([[1, 0], [1, 1], [0, 0], [0, 1], [0, 0]])[kind]
+    vertices = axes * scale * np.repeat(parts, 3, axis=-1)[:, None]
+    some = np.flatnonzero(kind == 2)
+    wrenches = [units(rng, len(some), DIRECTIONS) for _ in range(2)]
+    vertices[some] = np.concatenate(wrenches, axis=-1) * scale[some]
+    some = np.flatnonzero(kind == 4)
+    reached = wrench_of(lanes[some], rng.normal(size=(len(some), DIRECTIONS, *lanes.active.shape[1:], 3)))
+    vertices[some] = reached / np.maximum(np.abs(reached / scale[some]).max((1, 2), keepdims=True), 1e-300)
+    return replace(lanes, vertices=vertices)
 
 
 def loaded(rng: Generator, lanes: Lanes, borne: np.ndarray) -> Lanes:

@@ -1,4 +1,4 @@
-"""(21) of single lanes by HiGHS, from the rows of `rules`, in units of order one."""
+"""(21) of single lanes by HiGHS, from the rows of `rows`, in units of order one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import linprog
 
-from benchmarks.suite.rules import Model
+from benchmarks.suite.rows import Model
 
 OPTIONS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10, "presolve": False}
 TOGETHER = 16

@@ -68,9 +68,9 @@ def summary(own: list[dict], seconds: list[float]) -> str:
     text = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in bad.items()) or "none"
     return (
         f"{lanes:,} lanes, {counts['spoilt']:,} of them spoilt, each through both programs. **Faults: {text}.**\n"
-        f"HiGHS was asked about {counts['highs open']:,} lanes that their own forces and multipliers do not settle and\n"
-        f"{counts['highs sample']:,} others; {counts['unsettled']:,} stayed unsettled. Some bit of an answer depends on\n"
-        f"the neighbours in {counts['margin bits differ']:,} lanes of (21) and {counts['effort bits differ']:,} of (22).\n"
+        f"HiGHS was asked about {counts['highs open']:,} lanes that their own forces and multipliers do not settle\n"
+        f"and {counts['highs sample']:,} others; {counts['unsettled']:,} stayed unsettled. Some bit depends on\n"
+        f"neighbours in {counts['margin bits differ']:,} lanes of (21), {counts['effort bits differ']:,} of (22).\n"
         f"Solving took {seconds[0]:,.0f} s, compiling included, checking {seconds[1]:,.0f} s: "
         f"{lanes / sum(seconds):,.0f} lanes a second."
     )
@@ -122,11 +122,11 @@ families in `benchmarks/suite/families.py`, one in eight spoilt, solved by `larg
 `least_effort` (22) at 0 to 1.5 times the margin found. Two figures stand for (21) / (22).
 
 - **Wrong**: SOLVED and, in float64 NumPy, G f misses b by more than 1e-7 (float32: 3e-5) of the larger of |b| and the
-  sum of |f_i|, moments over the grasp's size; or a pyramid or bound row is exceeded, at the margin claimed or at the one
-  asked for, by more than 1e-7 (3e-5) of its max_force; or margin or upper bound is off the optimum by more than 1e-6
-  (1e-4) of the mean max_force. S_1 and S_2 come from a pseudo-inverse by singular values. The optimum lies between what
-  the lane's forces attain and what its multipliers exclude, both put into NumPy's own rows; where these do not settle
-  it, and for a random sample, HiGHS finds it.
+  sum of |f_i|, moments over the grasp's size; or a pyramid or bound row is exceeded, at the margin claimed or at the
+  one asked for, by more than 1e-7 (3e-5) of its max_force; or margin or upper bound is off the optimum by more than
+  1e-6 (1e-4) of the mean max_force. S_1 and S_2 come from a pseudo-inverse by singular values. The optimum lies
+  between what the lane's forces attain and what its multipliers exclude, both put into NumPy's own rows; where these do
+  not settle it, and for a random sample, HiGHS finds it.
 - **In doubt**: lanes with a singular value of G between 1e-13 and 1e-6 (1e-7 and 3e-3) of the largest, or with a load
   or disturbance of which a share between 1e-12 and 1e-6 (1e-6 and 3e-3) is out of reach. They are not among the wrong;
   those that break the first two rules, with the rank that the package says, stand beside their number.
