@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import truth  # noqa: E402
 from benchmarks.suite import families, lanes, rules  # noqa: E402
+from benchmarks.suite.grasps import DIRECTIONS  # noqa: E402
 from benchmarks.suite.lanes import Claims, Lanes  # noqa: E402
 from benchmarks.suite.rows import TOLERANCES  # noqa: E402
 from benchmarks.suite.truth_report import faults, report  # noqa: E402
@@ -33,7 +34,7 @@ def alike(name: str) -> Lanes:
         value = made.arrays()[key]
         missing = np.zeros((EACH, CONTACTS - value.shape[1], *value.shape[2:]), value.dtype)
         padded[key] = np.concatenate([value, missing], axis=1)
-    vertices = np.zeros((EACH, families.DIRECTIONS, 6))
+    vertices = np.zeros((EACH, DIRECTIONS, 6))
     if made.vertices is not None:
         vertices[:, : made.vertices.shape[1]] = made.vertices
     parts = {"half_extents": (6,), "radii": (2,), "shape_matrix": (6, 6)}

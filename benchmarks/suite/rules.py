@@ -91,18 +91,17 @@ def held(m: Model, claims: Claims, margin: np.ndarray, tolerances: Tolerances) -
     unbalanced = (m.imbalance(forces) > tolerances.rows) | stray | ~np.isfinite(claims.forces).all((1, 2))
     exceeded, beyond = (m.excess(forces, margin, allowed) > tolerances.rows for allowed in (0.0, 1.0))
     size = np.maximum(np.maximum(np.abs(claims.margin), np.abs(claims.upper_bound)), m.scale)
-    nothing = np.zeros_like(solved)
     return Findings(
         solved=solved,
         invalid=claims.status == INVALID,
         balance=solved & unbalanced,
         rows=solved & beyond,
         rounding=solved & exceeded & ~beyond,
-        value=nothing,
+        value=np.zeros_like(solved),
         crossed=solved & (claims.margin - claims.upper_bound > tolerances.crossed * size),
-        false_status=nothing,
-        open=nothing,
-        suboptimal=nothing,
+        false_status=np.zeros_like(solved),
+        open=np.zeros_like(solved),
+        suboptimal=np.zeros_like(solved),
     )
 
 
