@@ -10,7 +10,7 @@ from benchmarks.suite import certificates
 from benchmarks.suite.lanes import Claims
 from benchmarks.suite.rows import Model, Tolerances
 
-SOLVED, INFEASIBLE, UNBOUNDED, INVALID = 0, 1, 2, 5
+SOLVED, INFEASIBLE, UNBOUNDED, INVALID, NOT_VERIFIED = 0, 1, 2, 5, 7
 
 
 @dataclass(kw_only=True)
@@ -98,7 +98,7 @@ def held(m: Model, claims: Claims, margin: np.ndarray, tolerances: Tolerances) -
         rows=solved & beyond,
         rounding=solved & exceeded & ~beyond,
         value=np.zeros_like(solved),
-        crossed=solved & (claims.margin - claims.upper_bound > tolerances.crossed * size),
+        crossed=(claims.status != NOT_VERIFIED) & (claims.margin - claims.upper_bound > tolerances.crossed * size),
         false_status=np.zeros_like(solved),
         open=np.zeros_like(solved),
         suboptimal=np.zeros_like(solved),

@@ -132,7 +132,7 @@ families in `benchmarks/suite/families.py`, one in eight spoilt, solved by `larg
   those that break the first two rules, with the rank that the package says, stand beside their number.
 - **Within rounding**: a row is exceeded, but only by what rounding makes of S_1 and S_2 in NumPy itself.
 - **Crossed**: the upper bound is below the margin by more than 1e-11 (1e-5) of the larger of both and of the margin's
-  natural scale.
+  natural scale, whatever the status but NOT_VERIFIED.
 - **False status**: INFEASIBLE or UNBOUNDED where it is not.
 - **Harmed**: status or some field depends, by more than 1e-12 (1e-5) of it, on whether other lanes are spoilt.
 - **Spoilt, told wrong**: a spoilt lane is not INVALID_INPUT with NaN for margin and forces, or a sound one is.
