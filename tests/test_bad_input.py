@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 import harness
+import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
@@ -214,3 +215,11 @@ def test_wrong_dtypes():
     with pytest.raises(ValueError, match="positions"):
         shaped_complex = jnp.ones((4, 3), complex)
         jg.Contacts.from_frames(shaped_complex, jnp.ones((4, 3, 3)), friction=0.5, max_force=1.0)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_no_vertex_that_is_nan_is_passed_over_in_large_batches(dtype):
+    wrenches = np.ones((4096, 12, 6), dtype)
+    wrenches[np.arange(4096), np.arange(4096) % 12, np.arange(4096) % 6] = np.nan
+    extent = jax.jit(lambda w: jg.DisturbanceSet.vertices(w).terms[0].extent())(wrenches)
+    assert (np.isnan(extent).sum(-1) == 1).all()

@@ -61,7 +61,9 @@ class Vertices:
 
     def extent(self) -> jax.Array:
         """Componentwise maximum."""
-        return checked(jnp.max(jnp.abs(self.wrenches), -2, initial=0), self.width)
+        largest = jnp.max(jnp.abs(self.wrenches), -2, initial=0)
+        # XLA's CPU code for the maximum of many lanes was seen to pass over NaN.
+        return checked(jnp.where(jnp.isnan(self.wrenches).any(-2), jnp.nan, largest), self.width)
 
 
 def _over_vertices(vertices: Tree, row: jax.Array, raise_to: Callable, best: Tree) -> Tree:
