@@ -14,7 +14,7 @@ from jaxgrasp.ranking.tiles import columns_of, margins, solve_in_tiles, tighteni
 from jaxgrasp.solvers.status import Status
 
 _ANSWERED = (Status.SOLVED, Status.UNBOUNDED)
-_LAST = {Status.INFEASIBLE: 2, Status.INVALID_INPUT: 3}
+_LAST = {Status.INFEASIBLE: 2, Status.INVALID_INPUT: 3, Status.NOT_VERIFIED: 4}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """The paper: worst cases (17)-(18), margin (21), least effort (22), blocking forces (15), and the way to them."""
 
 from jaxgrasp.robustness.answers import FormulationSolution
+from jaxgrasp.robustness.auditing import audit
 from jaxgrasp.robustness.blocking import blocking_forces
 from jaxgrasp.robustness.comparison import (
     Comparison,
@@ -20,6 +21,7 @@ __all__ = [
     "Solution",
     "SpecifiedDisturbances",
     "TotalEffortSolution",
+    "audit",
     "blocking_forces",
     "compare_formulations",
     "formulation_margin",

@@ -28,6 +28,19 @@ from jaxgrasp.robustness.answers import (
     programs,
     solved_program,
 )
+from jaxgrasp.robustness.arguments import Arguments
+from jaxgrasp.robustness.auditing import Audited, hidden
+from jaxgrasp.robustness.auditing.chain import (
+    ChainVerdict,
+    admissible,
+    all_hold,
+    blocking_forces_stand,
+    disturbed_wrenches,
+    proven_bounds,
+    settled,
+)
+from jaxgrasp.robustness.auditing.problem import Problem, problem_of
+from jaxgrasp.robustness.auditing.pyramids import balanced
 from jaxgrasp.robustness.chain import (
     FORMULATIONS,
     Basics,
@@ -37,10 +50,12 @@ from jaxgrasp.robustness.chain import (
     contact_rows,
     scaled_formulation,
 )
-from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
 from jaxgrasp.robustness.kernels import Along
+from jaxgrasp.solvers.conic_margin import ConicPoint
 from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.lanes import Each
+from jaxgrasp.solvers.status import Status
 
 # Contacts under all directions in a tile.
 _TILE = 1024
@@ -128,7 +143,7 @@ def tile_of(contacts: Contacts, disturbances: DisturbanceSet) -> int:
 
 
 @dataclass(frozen=True)
-class Chain:
+class Chain(Audited):
     """The kernel of some formulations; its results are pairs of a solution and a scaled point, by name."""
 
     names: tuple[str, ...]
@@ -162,6 +177,67 @@ class Chain:
             still = jax.tree.map(lambda _: None, point)
             changed[name] = FormulationSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), still
         return changed
+
+    def judge(self, arguments: Arguments, out: dict, anew: bool) -> dict[str, ChainVerdict]:
+        """See `Audited`."""
+        problem = problem_of(arguments)
+        shared, scaled = self._scaled(grasps_of(arguments)) if anew else (None, {})
+        return {
+            name: self._judged(name, problem, solution, point, shared, scaled.get(self._twin(name)))
+            for name, (solution, point) in out.items()
+        }
+
+    def correct(self, out: dict, verdicts: dict[str, ChainVerdict]) -> dict:
+        """See `Audited`."""
+        changed = {}
+        for name, (solution, point) in out.items():
+            failed, confirmed = verdicts[name]
+            instead = {"margin": confirmed, "status": Status.NOT_VERIFIED}
+            instead |= dict.fromkeys(("upper_bound", "directions", "forces", "disturbed_forces", "gap"), jnp.nan)
+            fields_changed = {field: hidden(getattr(solution, field), failed, x) for field, x in instead.items()}
+            changed[name] = replace(solution, **fields_changed), point
+        return changed
+
+    def _judged(
+        self,
+        name: str,
+        problem: Problem,
+        solution: FormulationSolution,
+        point: ConicPoint,
+        shared: Basics | None,
+        scaled: Scaled | None,
+    ) -> ChainVerdict:
+        """The audit of one formulation; with programs put together anew also of what multipliers prove."""
+        form, margin, directions = FORMULATIONS[name], solution.margin, solution.directions
+        check = form.exact, self.cone_edges, self.norm_bound and form.exact
+        holds = jnp.ones(margin.shape, bool)
+        if name != "per_direction":
+            wrenches = disturbed_wrenches(problem, jnp.broadcast_to(margin[:, None], directions.shape))
+            holds &= balanced(problem, solution.forces) & admissible(problem, solution.forces, *check)
+            holds &= all_hold(problem, solution.disturbed_forces, wrenches, check)
+        else:
+            # Nothing ties the directions together but the smallest of their margins.
+            sizes = jnp.stack([problem.friction * problem.max_force] * 2 + [problem.max_force], 1)
+            forces = jnp.moveaxis(point.x[..., :-1] * sizes[..., None], (3, 2), (1, 2))
+            wrenches = disturbed_wrenches(problem, directions)
+            looked_at = jnp.isfinite(directions) & (directions > 0)
+            each = jax.vmap(lambda f, w: balanced(problem, f, w) & admissible(problem, f, *check), (1, 1), 1)
+            holds &= (each(forces, wrenches) | ~looked_at).all(1)
+        scale, proven = jnp.ones_like(margin), None
+        if shared is not None and scaled is not None:
+            last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), point)
+            bounds = proven_bounds(scaled.problem, last) * scaled.scale
+            bounds = jnp.broadcast_to(bounds[: 1 if bounds.shape[0] == 1 else directions.shape[1]], directions.T.shape)
+            bounds = jnp.where(shared.outside, 0, jnp.where(shared.disturbed, bounds, jnp.inf))
+            proven, scale = jnp.min(bounds, 0), jnp.max(scaled.scale, 0)
+            if not form.free and form.shared and problem.per_vertex is None:
+                changes = solution.disturbed_forces - solution.forces[:, None]
+                holds &= blocking_forces_stand(problem, changes, margin)
+        else:
+            scale = jnp.full_like(margin, jnp.inf)
+        solved = settled(margin, solution.upper_bound, proven, scale, holds)
+        claimed = solution.status == Status.SOLVED
+        return ChainVerdict(claimed & ~solved, jnp.where(holds, margin, jnp.nan))
 
     def _scaled(self, grasps: Grasps) -> tuple[Basics, dict[str, Scaled]]:
         """By name; formulations that solve the same programs share them."""

@@ -16,7 +16,7 @@ from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
-from jaxgrasp.robustness.arguments import laid_out
+from jaxgrasp.robustness.arguments import Arguments, laid_out
 from jaxgrasp.robustness.auditing import audited
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
@@ -127,8 +127,7 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
     leaves, batch = arguments.leaves, arguments.batch
 
     def admit(raw: dict[str, jax.Array]) -> Grasps:
-        terms = arguments.terms(raw)
-        return _admit(raw, terms, tuple(raw[f"extent {i}"] for i in range(len(terms))))
+        return admitted(arguments, raw)
 
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
     compact = kernel.tile is None and not {"compliance", "per_vertex", "weights"} & set(leaves)
@@ -145,8 +144,16 @@ def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given
 _TRANSMISSION = {"transmission", "inverse", "unreached"}
 
 
-def _admit(raw: dict[str, jax.Array], terms: tuple[Term, ...], extents: tuple[jax.Array, ...]) -> Grasps:
-    """Check the data of every lane and replace what cannot be used."""
+def grasps_of(arguments: Arguments) -> Grasps:
+    """The grasps of public arguments, outside of any kernel."""
+    leaves = arguments.leaves.items()
+    return admitted(arguments, {k: x[..., None] if arguments.shared[k] else jnp.moveaxis(x, 0, -1) for k, x in leaves})
+
+
+def admitted(arguments: Arguments, raw: dict[str, jax.Array]) -> Grasps:
+    """Check the data of every lane, lanes trailing, and replace what cannot be used."""
+    terms = arguments.terms(raw)
+    extents = tuple(raw[f"extent {i}"] for i in range(len(terms)))
     positions, frames, active = raw["positions"], raw["frames"], raw["active"]
     n, dtype = positions.shape[0], positions.dtype
     sound = jnp.isfinite(positions).all(1) & rotations(frames)

@@ -14,8 +14,8 @@ from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited
-from jaxgrasp.robustness.auditing.problem import Problem
 from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge
 from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
 from jaxgrasp.robustness.derivatives import CentralPoint, Point, central_kappa, centred, envelope_adjoint
@@ -191,8 +191,8 @@ class _Tightening(OfPyramids, Audited, ABC):
     @abstractmethod
     def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]: ...
 
-    def judge(self, problem: Problem, out: tuple[Solution, Evidence], turn: jax.Array, stride: int) -> Verdict:
-        return judge(problem, *out, turn, stride, self.smooth)
+    def judge(self, arguments: Arguments, out: tuple[Solution, Evidence], anew: bool) -> Verdict:
+        return judge(arguments, *out, anew, self.smooth)
 
     def correct(self, out: tuple[Solution, Evidence], verdicts: Verdict) -> tuple[Solution, Evidence]:
         return corrected(out[0], verdicts), out[1]
@@ -211,12 +211,12 @@ class _Tightening(OfPyramids, Audited, ABC):
 
 class _LargestDisturbance(_Tightening):
     def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]:
-        best, _, iterate = _solve_margin(grasps, program)
+        best, record, iterate = _solve_margin(grasps, program)
         solution = best
         if grasps.smoothing is not None:
             possible = ~(program.wrench_outside | program.disturbance_outside | program.undisturbed)
             solution = _at_centre(grasps, program, iterate, best, grasps.valid & possible)
-        return solution, _evidence(program, best)
+        return solution, _evidence(grasps, program, record)
 
     def tangents(self, along: Along, found: tuple[Solution, Evidence]) -> tuple[Solution, Evidence]:
         out = found[0]
@@ -231,7 +231,7 @@ class _LargestDisturbance(_Tightening):
 class _LeastEffort(_Tightening):
     def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]:
         first, record, _ = _solve_margin(replace(grasps, smoothing=None), program)
-        return _solve_effort(grasps, program, first, record), _evidence(program, first)
+        return _solve_effort(grasps, program, first, record), _evidence(grasps, program, record)
 
     def tangents(self, along: Along, found: tuple[Solution, Evidence]) -> tuple[Solution, Evidence]:
         out = found[0]
@@ -245,21 +245,22 @@ def _changed(found: tuple[Solution, Evidence], change: Point, upper_bound: jax.A
     return Solution(**{f.name: varying.get(f.name) for f in fields(Solution)}), still
 
 
-def _evidence(program: Program, best: Solution) -> Evidence:
+def _evidence(grasps: Grasps, program: Program, record: Record) -> Evidence:
     """What the audit needs beside the answer: the worst rows as they were solved, and what proves (21)'s bound."""
     unit = program.row_units() / program.scale
     cone_and_bound = jnp.where(program.undisturbed, 0, program.sigma * unit)
     effort = None
     if program.efforts is not None:
-        taken = program.efforts.sigma * (program.efforts.unit / program.scale)
-        effort = jnp.where(program.undisturbed, 0, taken)
+        effort = jnp.where(program.undisturbed, 0, program.efforts.sigma * (program.efforts.unit / program.scale))
+    multipliers = record.z[0] * program.scale / program.row_units()
+    actuated = actuated_values(program, record.x, record, grasps.units, program.scale)
     return Evidence(
         WorstRows(jnp.moveaxis(cone_and_bound[:-1], 0, 1), cone_and_bound[-1], effort),
-        best.cone_multipliers,
-        best.bound_multipliers,
-        best.wrench_multipliers,
-        best.actuator_multipliers,
-        best.joint_multipliers,
+        jnp.moveaxis(multipliers[:-1], 0, 1),
+        multipliers[-1],
+        program.wrench_multipliers(record.y, grasps.units) * program.scale,
+        actuated.get("actuator_multipliers"),
+        actuated.get("joint_multipliers"),
     )
 
 
@@ -270,7 +271,8 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, I
     settings = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     # Without a load, no forces at all are an answer with margin 0, exactly.
-    idle = (outcome.record.lower < 0) & _unloaded(grasps, program)
+    flat = program.disturbance_outside | program.slippery
+    idle = ((outcome.record.lower < 0) | flat) & _unloaded(grasps, program)
     record = outcome.record._replace(
         lower=jnp.where(idle, 0, outcome.record.lower),
         x=tuple(jnp.where(idle, 0, x) for x in outcome.record.x),

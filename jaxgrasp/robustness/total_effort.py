@@ -13,12 +13,23 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.answers import Verdict, programs, solved_program, verdict
+from jaxgrasp.robustness.arguments import Arguments
+from jaxgrasp.robustness.auditing import Audited, hidden
+from jaxgrasp.robustness.auditing.chain import (
+    EffortVerdict,
+    admissible,
+    all_hold,
+    disturbed_wrenches,
+    least_total_effort_stands,
+)
+from jaxgrasp.robustness.auditing.problem import problem_of
+from jaxgrasp.robustness.auditing.pyramids import balanced
 from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formulation
 from jaxgrasp.robustness.formulations import check_vertices, tile_of
-from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.arrow_problem import ArrowProblem, ArrowRecord, patterns_of
+from jaxgrasp.solvers.arrow_problem import ArrowProblem, patterns_of
 from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.interior_point import Settings
 from jaxgrasp.solvers.lanes import Each
@@ -110,7 +121,7 @@ def least_total_effort(
 
 
 @dataclass(frozen=True)
-class _TotalEffort(OfPyramids):
+class _TotalEffort(OfPyramids, Audited):
     tile: int
 
     @property
@@ -126,7 +137,35 @@ class _TotalEffort(OfPyramids):
         solution, record = out
         (change,) = along.adjoint(self._adjoint, out, (solution.effort,))
         moved = {"effort": change, "lower_bound": change}
-        return TotalEffortSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), ArrowRecord(*[None] * 5)
+        return TotalEffortSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), jax.tree.map(
+            lambda _: None, record
+        )
+
+    def judge(self, arguments: Arguments, out: tuple, anew: bool) -> EffortVerdict:
+        """See `Audited`."""
+        problem, (solution, record) = problem_of(arguments), out
+        wrenches = disturbed_wrenches(problem, jnp.broadcast_to(problem.margin[:, None], solution.changes.shape[:2]))
+        disturbed, check = solution.forces[:, None] + solution.changes, (False, self.cone_edges, False)
+        holds = balanced(problem, solution.forces) & admissible(problem, solution.forces, *check)
+        holds &= all_hold(problem, disturbed, wrenches, check) & (solution.lower_bound <= solution.effort)
+        if anew:
+            grasps = grasps_of(arguments)
+            last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), record)
+            effort, unit = _problem(grasps, basics(grasps, False), self.cone_edges, last.x)
+            found = effort.objective(last.x), effort.proven(last)
+            holds &= least_total_effort_stands(solution.effort, found[1] * unit, found[0] * unit, unit)
+        return EffortVerdict((solution.status == Status.SOLVED) & ~holds)
+
+    def correct(self, out: tuple, verdicts: EffortVerdict) -> tuple:
+        """See `Audited`."""
+        solution, record = out
+        changed = {
+            f.name: hidden(getattr(solution, f.name), verdicts.failed, jnp.nan)
+            for f in fields(solution)
+            if f.name not in ("status", "iterations")
+        }
+        status = hidden(solution.status, verdicts.failed, Status.NOT_VERIFIED)
+        return replace(solution, **changed, status=status), record
 
     def _free(self, grasps: Grasps) -> tuple:
         shared = basics(grasps, False)

@@ -24,13 +24,14 @@ from jaxgrasp.solvers.triples import back, cholesky
 
 
 class ArrowRecord(NamedTuple):
-    """Best bounds so far, certified, and the points that give them: x one of them, (y, z) the other."""
+    """Best bounds so far, certified, and the points that give them: x one of them, (y, z) with `tangent` the other."""
 
     lower: jax.Array
     upper: jax.Array
     x: jax.Array
     y: jax.Array
     z: jax.Array
+    tangent: jax.Array
 
 
 class _Factors(NamedTuple):
@@ -219,7 +220,7 @@ class ArrowProblem:
         """Nothing is known."""
         inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
         rows = jnp.zeros((self.patterns.shape[0], *self.guess.shape[1:]), self.rhs.dtype)
-        return ArrowRecord(-inf, inf, jnp.zeros_like(self.guess), jnp.zeros_like(self.rhs), rows)
+        return ArrowRecord(-inf, inf, jnp.zeros_like(self.guess), jnp.zeros_like(self.rhs), rows, self.guess)
 
     def gap_scale(self, record: ArrowRecord) -> jax.Array:
         """The effort, but not less than a thousandth of a unit."""
@@ -241,7 +242,14 @@ class ArrowProblem:
             x=jnp.where(falls, x, record.x),
             y=jnp.where(rises, iterate.y, record.y),
             z=jnp.where(rises, iterate.z, record.z),
+            tangent=jnp.where(rises, iterate.x, record.tangent),
         )
+
+    def proven(self, record: ArrowRecord) -> jax.Array:
+        """What the multipliers prove about the least objective, by its tangent, (*lanes)."""
+        slope = self.gradient(record.tangent) + self.adjoint(record.z) + self.pull_back(record.y)
+        held = _total(self.h * record.z) + fold(jnp.add, fold(jnp.add, record.y * self.rhs))
+        return -self.objective(record.tangent) - held - _total(jnp.abs(slope))
 
     def lagrangian(self, record: ArrowRecord) -> jax.Array:
         """Objective and what is lacking, weighed by the multipliers: its derivative is the optimum's (envelope)."""

@@ -15,9 +15,12 @@ import numpy as np
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.robustness.arguments import laid_out
+from jaxgrasp.robustness.arguments import Arguments, laid_out
 from jaxgrasp.robustness.auditing import setting
-from jaxgrasp.robustness.auditing.problem import Problem, problem_of
+from jaxgrasp.robustness.auditing.problem import every, picked
+from jaxgrasp.robustness.auditing.setting import audit
+
+__all__ = ["Audited", "audit", "audited", "hidden"]
 
 Tree = Any
 # Batches up to this size are recomputed whole: there is nothing to save.
@@ -28,19 +31,24 @@ class Audited(ABC):
     """A kernel whose answers can be audited."""
 
     @abstractmethod
-    def judge(self, problem: Problem, out: Tree, turn: jax.Array, stride: int) -> Tree:
+    def judge(self, arguments: Arguments, out: Tree, anew: bool) -> Tree:
         """Verdicts with a field `failed`, bool (lanes,), on results with lanes leading.
 
         Args:
-            problem: the public arguments.
+            arguments: the public arguments.
             out: the kernel's results.
-            turn: which lane of every `stride` is computed anew.
-            stride: 1 computes all of them anew.
+            anew: with everything computed anew that the solver only claims to have used.
         """
 
     @abstractmethod
     def correct(self, out: Tree, verdicts: Tree) -> Tree:
         """The results with what the audit confirms in place of what it does not."""
+
+
+def hidden(value: jax.Array, failed: jax.Array, instead: Any) -> jax.Array:
+    """A result (*batch, ...) with something else where the audit failed, (*batch)."""
+    mask = failed.reshape(*failed.shape, *[1] * (value.ndim - failed.ndim))
+    return jnp.where(mask, jnp.asarray(instead, value.dtype), value)
 
 
 def audited(kernel: Any, out: Tree, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Tree:
@@ -77,9 +85,22 @@ def _verdicts(
     lead = len(arguments.batch)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), out)
     lanes = jax.tree.leaves(flat)[0].shape[0]
-    verdicts = kernel.judge(problem_of(arguments), flat, turn, stride if lanes > _SMALL else 1)
+    verdicts = kernel.judge(arguments, flat, stride == 1 or lanes <= _SMALL)
+    if stride > 1 and lanes > _SMALL:
+        some = jax.tree.map(lambda x: every(x, turn, stride), flat)
+        verdicts = jax.tree.map(
+            partial(_merged, turn), verdicts, kernel.judge(picked(arguments, turn, stride), some, True)
+        )
     failed = jnp.sum(jnp.stack([jnp.sum(verdict) for verdict in _flags(verdicts)]))
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), verdicts), failed
+
+
+def _merged(turn: jax.Array, coarse: jax.Array, fine: jax.Array) -> jax.Array:
+    """Verdicts on all lanes with those on lane `turn` of every stride in their place."""
+    stride = coarse.shape[0] // fine.shape[0]
+    blocks = coarse[: fine.shape[0] * stride].reshape(-1, stride)
+    blocks = jnp.where(jnp.arange(stride, dtype=turn.dtype) == turn, fine[:, None], blocks).reshape(-1)
+    return jnp.concatenate([blocks, coarse[blocks.shape[0] :]])
 
 
 def _flags(verdicts: Tree) -> list[jax.Array]:

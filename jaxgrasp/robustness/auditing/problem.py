@@ -1,5 +1,6 @@
 """The data of the grasps as the audit sees them: the public arguments, lanes leading, in newtons and metres."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -68,6 +69,7 @@ def problem_of(arguments: Arguments) -> Problem:
     square = (positions * positions).sum((-2, -1)) / count
     last = {name: jnp.moveaxis(x, 0, -1) for name, x in leaves.items() if name.startswith("term")}
     terms = arguments.terms(last)
+    strongest = jnp.where(present, max_force, 0)
     return Problem(
         positions=positions,
         frames=here("frames", 0),
@@ -84,7 +86,9 @@ def problem_of(arguments: Arguments) -> Problem:
         weights=leaves.get("weights"),
         margin=leaves.get("margin"),
         cutoff=leaves.get("cutoff"),
-        hand=_hand(leaves, here("jacobian", 0), friction, max_force * present) if "jacobian" in leaves else None,
+        hand=_hand(leaves, here("jacobian", 0), friction, jnp.where(present, max_force, 0))
+        if "jacobian" in leaves
+        else None,
     )
 
 
@@ -112,15 +116,10 @@ def _hand(leaves: dict[str, jax.Array], jacobian: jax.Array, friction: jax.Array
     )
 
 
-def lanes_of(problem: Problem, turn: jax.Array, stride: int) -> Problem:
-    """The problems of one lane in `stride`, see `every`."""
-    lanes = problem.positions.shape[0]
-    leading = lambda x: every(x, turn, stride) if x.shape[0] == lanes else x  # noqa: E731
-    trailing = lambda x: (  # noqa: E731
-        jnp.moveaxis(every(jnp.moveaxis(x, -1, 0), turn, stride), 0, -1) if x.shape[-1] == lanes else x
-    )
-    picked = jax.tree.map(leading, problem._replace(terms=()))
-    return picked._replace(terms=jax.tree.map(trailing, problem.terms))
+def picked(arguments: Arguments, turn: jax.Array, stride: int) -> Arguments:
+    """The arguments of one lane in `stride`, see `every`."""
+    leaves = {name: x if arguments.shared[name] else every(x, turn, stride) for name, x in arguments.leaves.items()}
+    return replace(arguments, leaves=leaves)
 
 
 def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:

@@ -15,7 +15,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.robustness.auditing.problem import Problem, every, facets, lanes_of
+from jaxgrasp.robustness.arguments import Arguments
+from jaxgrasp.robustness.auditing import hidden
+from jaxgrasp.robustness.auditing.problem import Problem, facets, problem_of
 from jaxgrasp.robustness.auditing.rows import Range, Rows, cross, own_rows
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers.status import Status
@@ -24,6 +26,8 @@ from jaxgrasp.solvers.status import Status
 # and its proof. What counts as wrong is the same for rows, and ten times as much for bounds.
 MISSED = {"float64": 1e-7, "float32": 3e-5}
 CLOSED = {"float64": 2e-7, "float32": 2e-4}
+# Forces below this share of the largest are rounding.
+_NOTHING = {"float64": 1e-8, "float32": 1e-3}
 
 
 class Evidence(NamedTuple):
@@ -50,57 +54,36 @@ class Verdict(NamedTuple):
     upper_bound: jax.Array
 
 
-def judge(
-    problem: Problem, solution: Solution, evidence: Evidence, turn: jax.Array, stride: int, smooth: bool
-) -> Verdict:
-    """Audit every lane, and one in `stride` with S_1 and S_2 computed anew.
+def judge(arguments: Arguments, solution: Solution, evidence: Evidence, anew: bool, smooth: bool) -> Verdict:
+    """Audit every lane.
 
     Args:
-        problem: the public arguments.
-        solution: of (21), or of (22) where the problem asks for a margin; leaves (lanes, ...).
+        arguments: the public arguments.
+        solution: of (21), or of (22) where a margin is asked for; leaves (lanes, ...).
         evidence: what the solver adds.
-        turn: which lane of every `stride` is computed anew.
-        stride: 1 computes all of them anew.
+        anew: with S_1 and S_2 computed anew, not those that the solver used.
         smooth: whether a central point is claimed, which need not be optimal.
     """
-    edges = solution.cone_multipliers.shape[-1]
-
-    def anew(problem: Problem, solution: Solution, evidence: Evidence) -> Verdict:
-        rows, place = own_rows(problem, edges, solution.rank)
-        return _judged(problem, solution, evidence, rows, place, smooth)
-
-    if stride == 1:
-        return anew(problem, solution, evidence)
-    all_lanes = _judged(problem, solution, evidence, evidence.rows, None, smooth)
-    pick = lambda tree: jax.tree.map(lambda x: every(x, turn, stride), tree)  # noqa: E731
-    some = anew(lanes_of(problem, turn, stride), pick(solution), pick(evidence))
-
-    def merged(coarse: jax.Array, fine: jax.Array) -> jax.Array:
-        blocks = coarse[: fine.shape[0] * stride].reshape(-1, stride)
-        blocks = jnp.where(jnp.arange(stride) == turn, fine[:, None], blocks).reshape(-1)
-        return jnp.concatenate([blocks, coarse[blocks.shape[0] :]])
-
-    return jax.tree.map(merged, all_lanes, some)
+    problem, rows, place = problem_of(arguments), evidence.rows, None
+    if anew:
+        rows, place = own_rows(problem, solution.cone_multipliers.shape[-1], solution.rank)
+    return _judged(problem, solution, evidence, rows, place, smooth)
 
 
 def corrected(solution: Solution, verdict: Verdict) -> Solution:
     """The solution with what the audit confirms in place of what it does not."""
-    failed = verdict.failed
     instead = {
         "margin": verdict.margin,
         "upper_bound": verdict.upper_bound,
-        "status": jnp.int32(Status.NOT_VERIFIED),
+        "status": Status.NOT_VERIFIED,
         **dict.fromkeys(("forces", "effort", "gap", "actuator_efforts"), jnp.nan),
         **dict.fromkeys(("cone_multipliers", "bound_multipliers", "wrench_multipliers", "actuator_multipliers"), 0.0),
         "joint_multipliers": 0.0,
     }
 
-    def changed(name: str, value: jax.Array) -> jax.Array:
-        mask = failed.reshape(*failed.shape, *[1] * (value.ndim - failed.ndim))
-        return jnp.where(mask, instead[name], value)
-
     given = {name: getattr(solution, name) for name in instead}
-    return replace(solution, **{name: changed(name, value) for name, value in given.items() if value is not None})
+    changed = {name: hidden(x, verdict.failed, instead[name]) for name, x in given.items() if x is not None}
+    return replace(solution, **changed)
 
 
 def _judged(
@@ -109,9 +92,8 @@ def _judged(
     dtype = solution.margin.dtype.name
     status, asked = solution.status, problem.margin
     scale = natural_scale(problem, rows)
-    proven = _upper_bound(problem, evidence, rows)
+    proven, refuted = _upper_bound(problem, evidence, rows)
     proven = jnp.where(_flat(problem, solution, rows, place, proven), 0, proven)
-    proven = jnp.where(rows_size(rows) == 0, jnp.inf, proven)
     holds, attained = _primal(problem, solution, rows)
     slack = CLOSED[dtype] * jnp.maximum(scale, jnp.abs(jnp.where(jnp.isfinite(attained), attained, 0)))
 
@@ -123,12 +105,12 @@ def _judged(
     if not smooth:
         solved &= upper - margin <= slack if asked is None else _least(problem, solution, rows)
     idle = holds & (attained == jnp.inf) & (margin == jnp.inf)
-    borne = (proven < 0) | jnp.isnan(margin) & _outside(solution, place)
+    unbearable = refuted | jnp.isnan(margin) & _outside(solution, place)
     if asked is not None:
-        borne |= proven < asked
+        unbearable |= proven < asked
     stands = jnp.select(
         [status == Status.SOLVED, status == Status.UNBOUNDED, status == Status.INFEASIBLE, status == Status.PRUNED],
-        [solved, idle, borne, bounded],
+        [solved, idle, unbearable, bounded],
         True,
     )
     confirmed = jnp.where(holds & (attained > -jnp.inf), attained, jnp.nan)
@@ -136,10 +118,11 @@ def _judged(
 
 
 def natural_scale(problem: Problem, rows: Rows) -> jax.Array:
-    """Lambda (lanes,): the disturbance that by itself takes a whole row, 1 where nothing disturbs."""
-    share = jnp.maximum(problem.friction * problem.max_force, 1e-9 * problem.max_force)
-    largest = jnp.maximum((rows.cone.max(-1) / share).max(-1), (rows.bound / problem.max_force).max(-1))
-    return jnp.where(largest > 0, 1 / jnp.where(largest > 0, largest, 1), 1)
+    """The disturbance that takes a row of the mean force, (lanes,), 1 where nothing disturbs."""
+    present = problem.present.astype(problem.max_force.dtype)
+    mean = (problem.max_force * present).sum(-1) / jnp.maximum(present.sum(-1), 1)
+    largest = rows_size(rows)
+    return jnp.where(largest > 0, mean / jnp.where(largest > 0, largest, 1), 1)
 
 
 def rows_size(rows: Rows) -> jax.Array:
@@ -194,7 +177,9 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
         -1,
     )
     largest = jnp.maximum(jnp.abs(wanted[:, :3]).max(-1), jnp.abs(wanted[:, 3:] / size).max(-1))
+    # Forces that are nothing but rounding are none.
     largest = jnp.maximum(largest, jnp.sqrt((f * f).sum(-1)).sum(-1))
+    largest = jnp.maximum(largest, _NOTHING[f.dtype.name] * jnp.where(problem.present, problem.max_force, 0).max(-1))
     return jnp.abs(missing).max(-1) <= MISSED[f.dtype.name] * largest
 
 
@@ -232,8 +217,8 @@ def _lost(problem: Problem, residual: jax.Array) -> jax.Array:
     return (tangential + residual[..., 2]) * problem.max_force
 
 
-def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> jax.Array:
-    """What the multipliers prove, (lanes,); inf where nothing."""
+def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.Array, jax.Array]:
+    """The bound that the multipliers prove, inf where none, and whether they prove that b cannot be borne; (lanes,)."""
     cone, bound, y = evidence.cone_multipliers, evidence.bound_multipliers, evidence.wrench_multipliers
     residual, total = _pulled(problem, cone, bound, y)
     pull = (cone * rows.cone).sum((-2, -1)) + (bound * rows.bound).sum(-1)
@@ -245,7 +230,8 @@ def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> jax.Array:
         sound &= evidence.actuator_multipliers.min((-2, -1)) >= 0
     each = bound * problem.max_force - total * problem.reserve[:, None] + _lost(problem, residual + more)
     value = value + jnp.where(problem.present, each, 0).sum(-1)
-    return jnp.where(sound & (pull > 0), value / jnp.where(pull > 0, pull, 1), jnp.inf)
+    bound = jnp.where(sound & (pull > 0), value / jnp.where(pull > 0, pull, 1), jnp.inf)
+    return bound, sound & (value < 0)
 
 
 def _of_efforts(problem: Problem, evidence: Evidence | Solution, rows: Rows) -> tuple:
@@ -279,7 +265,7 @@ def _outside(solution: Solution, place: Range | None) -> jax.Array:
 def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     """Whether no forces need less effort, by the multipliers of (22), (lanes,).
 
-    1/2 f'Q_0 f >= -1/2 r'Q_0^-1 r - h'z - b'y with r = A'z + G'y, for all admissible f.
+    1/2 f'Q_0 f >= min (1/2 f'Q_0 f + r'f) - h'z - b'y with r = A'z + G'y, for all admissible f.
     """
     dtype, there, forces, asked = solution.forces.dtype.name, problem.present, solution.forces, problem.margin
     cone, bound, y = solution.cone_multipliers, solution.bound_multipliers, solution.wrench_multipliers
@@ -292,18 +278,19 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
         more, (pull, value), spent = _of_efforts(problem, solution, rows)
         residual, held = residual + more, held + value + spent - pull * asked
         sound &= solution.actuator_multipliers.min((-2, -1)) >= 0
-    residual = jnp.where(there[:, :, None], residual, 0)
     if problem.weights is None:
         largest, weighed, answered = 1.0, forces, residual
     else:
         weights = jnp.where(there[:, :, None, None], problem.weights, jnp.eye(3, dtype=forces.dtype))
         largest = jnp.abs(weights).max((-2, -1))
         weighed, answered = jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
-    effort = 0.5 * (forces * weighed).sum((-2, -1))
-    lower = -0.5 * (residual * answered).sum((-2, -1)) - held
+    own = 0.5 * (forces * weighed).sum(-1)
+    # Of every contact the better of two bounds: without its limits, and by the tangent at f_0 within them.
+    least = jnp.maximum(-0.5 * (residual * answered).sum(-1), -own - _lost(problem, weighed + residual))
+    effort, lower = (jnp.where(there, part, 0).sum(-1) for part in (own, least))
     unit = jnp.where(there, largest * problem.max_force**2, 0).max(-1)
     near = CLOSED[dtype] * jnp.maximum(effort, 1e-3 * unit)
-    return sound & (effort - lower <= near) & (jnp.abs(effort - solution.effort) <= near)
+    return sound & (effort - (lower - held) <= near) & (jnp.abs(effort - solution.effort) <= near)
 
 
 def _divided(vectors: jax.Array, matrices: jax.Array) -> jax.Array:

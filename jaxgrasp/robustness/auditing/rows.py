@@ -77,6 +77,13 @@ def own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, 
     return found, _range(problem, plain)
 
 
+def own_inverse(problem: Problem) -> jax.Array:
+    """G* of wrenches in N and N m, (3 n, 6, lanes); for one compliance, or none."""
+    rows = _stacked_rows(problem)
+    inverse = _weighted(rows, problem, problem.compliance, None, echelon(rows, None))
+    return inverse[:, :6] * _units(problem.size)
+
+
 def _stacked_rows(problem: Problem) -> jax.Array:
     """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, 3 n, lanes)."""
     arms = jnp.broadcast_to(problem.positions[:, :, :, None], problem.frames.shape)
@@ -121,7 +128,7 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
         row = row - product("lr,lrk->lk", again, basis)
         length = jnp.sqrt(squares(row))
         kept = length > RANK_TOLERANCE[dtype.name] * longest if rank is None else j < rank
-        stands &= jnp.where(kept, length > least, length < most)
+        stands &= jnp.where(kept, length > least, length <= most)
         unit = row * jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)[:, None]
         share = product("lrk,lk->lr", rows[..., :width], unit[:, :width])
         basis = lax.dynamic_update_index_in_dim(basis, unit[:, None], j, 1)
