@@ -81,9 +81,11 @@ OF_EFFORT = {
     "no forces": CHANGES["no forces"],
     "effort": lambda s, _: replace(s, effort=s.effort.at[HURT].multiply(1.01)),
 }
-CASES = [("(21)", name) for name in CHANGES] + [("13", name) for name in CHANGES] + [("12_fixed", "forces")]
+CASES = [("(21)", name) for name in CHANGES]
 CASES += [("(22)", name) for name in [*OF_EFFORT, "margin too large", "upper bound too small"]]
-CASES += [("(11)", name) for name in OF_EFFORT]
+# Programs of the chain take long to compile.
+SLOW = [(program, name) for program in ("13", "12_fixed") for name in CHANGES] + [("(11)", name) for name in OF_EFFORT]
+CASES += [pytest.param(*case, marks=pytest.mark.thorough) for case in SLOW]
 
 
 @pytest.mark.parametrize(("program", "fault"), CASES)
@@ -100,13 +102,12 @@ def test_strict_audit_finds_a_fault_in_one_lane_alone(monkeypatch, given, progra
     assert np.isnan(found.forces[HURT]).all() and not np.isnan(found.forces[HURT + 1]).any()
 
 
-@pytest.mark.parametrize(
-    "fault", ["forces", "no forces", "margin too large", "margin too small", "upper bound too small"]
-)
-@pytest.mark.parametrize("program", ["(21)", "(22)"])
+SEEN_BY_DEFAULT = [("(21)", name) for name in CHANGES]
+SEEN_BY_DEFAULT += [("(22)", name) for name in ("forces", "no forces", "margin too large", "upper bound too small")]
+
+
+@pytest.mark.parametrize(("program", "fault"), SEEN_BY_DEFAULT)
 def test_default_audit_finds_a_fault_in_any_lane(monkeypatch, given, program, fault):
-    if program == "(22)" and fault == "margin too small":
-        pytest.skip("what forces certify may be reported lower")
     hurt(monkeypatch, program, CHANGES[fault])
     assert solved(given, program).status[HURT] == STATUS.NOT_VERIFIED
 
@@ -123,16 +124,17 @@ def test_multipliers_that_prove_nothing_are_found(monkeypatch, given):
 
 
 def test_claims_of_solved_or_infeasible_without_proof(monkeypatch, given):
+    given = (*given[:2], jg.required_wrench(2.0))
     statuses = np.asarray(solved(given, "(21)").status)
-    cannot = int(np.flatnonzero(statuses == STATUS.INFEASIBLE)[0])
+    cannot, can = (int(np.flatnonzero(statuses == status)[0]) for status in (STATUS.INFEASIBLE, STATUS.SOLVED))
 
     def change(solution, _):
-        status = solution.status.at[HURT].set(STATUS.INFEASIBLE).at[cannot].set(STATUS.SOLVED)
+        status = solution.status.at[can].set(STATUS.INFEASIBLE).at[cannot].set(STATUS.SOLVED)
         return replace(solution, status=status)
 
     hurt(monkeypatch, "(21)", change)
     found = solved(given, "(21)").status
-    assert found[HURT] == STATUS.NOT_VERIFIED and found[cannot] == STATUS.NOT_VERIFIED
+    assert found[can] == STATUS.NOT_VERIFIED and found[cannot] == STATUS.NOT_VERIFIED
 
 
 def test_a_wrong_rank_or_wrong_worst_rows_are_found_when_they_are_computed_anew(monkeypatch, given):

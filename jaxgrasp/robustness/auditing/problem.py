@@ -86,9 +86,7 @@ def problem_of(arguments: Arguments) -> Problem:
         weights=leaves.get("weights"),
         margin=leaves.get("margin"),
         cutoff=leaves.get("cutoff"),
-        hand=_hand(leaves, here("jacobian", 0), friction, jnp.where(present, max_force, 0))
-        if "jacobian" in leaves
-        else None,
+        hand=_hand(leaves, here("jacobian", 0), friction, strongest) if "jacobian" in leaves else None,
     )
 
 
