@@ -129,6 +129,7 @@ def blocks(*shape: int) -> Callable[[jnp.dtype], jax.Array]:
 SMOOTHING = {"smoothing": number(1e-3)}
 GROUPS: dict[str, dict[str, Program]] = {
     "plain": {"margin": margin, "effort": effort},
+    "smooth": {"smoothed set": partial(margin, disturbances="smoothed")},
     "gradients": {
         "of margins": partial(gradient, of=margin, field="margin"),
         "of efforts": partial(gradient, of=effort, field="effort", share=0.2),

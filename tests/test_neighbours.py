@@ -1,0 +1,94 @@
+"""A lane's answer is its own: whatever its neighbours are, and as if it were alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax.numpy as jnp
+import kernel_programs
+import numpy as np
+import problems
+import pytest
+
+import jaxgrasp as jg
+
+CASES = [(group, "float64", xla) for group in ("plain", "smooth") for xla in (False, True)]
+GROUPS = [g for g in kernel_programs.GROUPS if "derivative" not in g and g != "gradients"]
+THOROUGH = [(group, dtype, xla) for group in GROUPS for dtype in ("float64", "float32") for xla in (False, True)]
+THOROUGH = [pytest.param(*case, marks=pytest.mark.thorough) for case in THOROUGH if case not in CASES]
+
+SPOILT = np.arange(kernel_programs.LANES) % 8 == 3
+
+
+def spoilt(batch: problems.Batch) -> problems.Batch:
+    """One lane in eight: NaN, no normal, one point, a line, forces without bound, negative friction."""
+    new = {name: getattr(batch, name).copy() for name in ("positions", "frames", "friction", "max_force")}
+    for number, lane in enumerate(np.flatnonzero(SPOILT)):
+        kind = number % 6
+        if kind == 0:
+            new["positions"][lane] = np.nan
+        elif kind == 1:
+            new["frames"][lane] = 0
+        elif kind == 2:
+            new["positions"][lane] = new["positions"][lane, :1]
+        elif kind == 3:
+            new["positions"][lane] *= [1, 0, 0]
+        elif kind == 4:
+            new["max_force"][lane] = np.inf
+        else:
+            new["friction"][lane] = -1
+    return replace(batch, **new)
+
+
+def answers(group: str, dtype: str, xla: bool, change: Callable[[problems.Batch], problems.Batch], monkeypatch) -> dict:
+    original = kernel_programs.batch
+    with monkeypatch.context() as patch:
+        patch.setattr(kernel_programs, "batch", lambda *args: change(original(*args)))
+        return (kernel_programs.answers_of_xla if xla else kernel_programs.answers)(group, dtype)
+
+
+@pytest.mark.parametrize(("group", "dtype", "xla"), CASES + THOROUGH)
+def test_neighbours_that_are_spoilt_change_nothing(group, dtype, xla, monkeypatch):
+    clean = answers(group, dtype, xla, lambda batch: batch, monkeypatch)
+    beside = answers(group, dtype, xla, spoilt, monkeypatch)
+    wrong = {name: kernel_programs.differing(x[~SPOILT], beside[name][~SPOILT]) for name, x in clean.items()}
+    assert not {name: lanes for name, lanes in wrong.items() if len(lanes)}
+
+
+@pytest.mark.parametrize(
+    ("group", "dtype", "xla"),
+    [("smooth", "float64", False)]
+    + [
+        pytest.param(g, d, x, marks=pytest.mark.thorough)
+        for g in ("plain", "sets", "edges")
+        for d in ("float64", "float32")
+        for x in (False, True)
+    ],
+)
+def test_a_lane_in_company_is_as_among_its_like(group, dtype, xla, monkeypatch):
+    """A batch of one lane alone, again and again, has the shape of any other batch, and the same program."""
+    together = answers(group, dtype, xla, spoilt, monkeypatch)
+    for lane in (0, 3, 7, 11, 19, 27, 35, 43, 402):
+        alone = answers(group, dtype, xla, lambda batch, k=lane: spoilt(batch)[np.full(len(batch), k)], monkeypatch)
+        wrong = {name: kernel_programs.differing(x[lane : lane + 1], alone[name][:1]) for name, x in together.items()}
+        assert not {name: lanes for name, lanes in wrong.items() if len(lanes)}, lane
+
+
+@pytest.mark.parametrize("disturbances", [jg.DisturbanceSet.forces(1.0), jg.DisturbanceSet.ball(1.0)])
+def test_smoothed_sets_of_grasps_without_full_rank(disturbances):
+    """A jaw, four contacts on a line, and four in a plane: margins are those of the set but for the smoothing."""
+    along, across = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+    normals = np.array(
+        [[along, -along, along, -along], [along, -along, along, -along], [along, -along, across, -across]]
+    )
+    positions = 0.03 * normals * np.array([[1, 1, 1, 1], [1, 1, 0.5, 0.5], [1, 1, 1, 1]])[..., None]
+    active = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1]], bool)
+    contacts = jg.Contacts.from_normals(positions, normals, friction=0.6, max_force=10.0, active=active)
+    exact = jg.largest_disturbance(contacts, disturbances)
+    assert (np.asarray(exact.rank) == [5, 5, 6]).all() and (np.asarray(exact.margin) > 1).all()
+    smooth = jg.largest_disturbance(contacts, disturbances.smoothed(jnp.asarray([[1e-2], [1e-6], [1e-12]])))
+    assert (np.asarray(smooth.status) == jg.Status.SOLVED).all()
+    share = np.asarray(smooth.margin / exact.margin)
+    assert (share <= 1 + 1e-7).all() and (share[0] > 0.95).all() and (share[1:] > 1 - 1e-5).all()
+    assert (np.asarray(smooth.upper_bound) >= np.asarray(smooth.margin)).all()
