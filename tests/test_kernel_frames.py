@@ -6,14 +6,17 @@ import re
 from functools import partial
 
 import frame_reads
+import jax
 import jax.numpy as jnp
 import kernel_targets
+import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from jax import lax
 
 from jaxgrasp import kernels
 from jaxgrasp.kernels import cpu, machine, native
+from jaxgrasp.kernels.lowering import lowered
 
 TARGETS = kernel_targets.targets()
 
@@ -82,6 +85,21 @@ def test_spoilt_memory_changes_nothing(target, dtype):
     for call in calls:
         for name, x in call.items():
             np.testing.assert_allclose(x.reshape(len(x), -1), wanted[name], rtol=1e-4 if dtype == "float32" else 1e-12)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_the_code_for_avx_512_reads_what_it_wrote_and_compiles_anywhere(dtype):
+    given = [jax.ShapeDtypeStruct((*x.shape[1:], 1), x.dtype) for x in inputs(dtype)]
+    program = lowered(jax.make_jaxpr(function)(given), [False, False])
+    text = cpu.module(program, "here", 64 // jnp.dtype(dtype).itemsize, estimates=True)
+    assert frame_reads.unwritten(text) == []
+    triple = llvm.get_process_triple()
+    if not triple.startswith("x86_64"):
+        pytest.skip("LLVM here is for other processors")
+    module = llvm.parse_assembly(text)
+    module.triple = triple
+    target = llvm.Target.from_triple(triple).create_target_machine(cpu="skylake-avx512", features="-prefer-256-bit")
+    assert "zmm" in target.emit_assembly(module)
 
 
 @pytest.fixture(scope="module")
