@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import kernel_programs
 import numpy as np
@@ -12,11 +14,14 @@ import problems
 import pytest
 
 import jaxgrasp as jg
+from jaxgrasp import kernels
 
-CASES = [(group, "float64", xla) for group in ("plain", "smooth") for xla in (False, True)]
+Change = Callable[[problems.Batch], problems.Batch]
+
+QUICK = [("plain", "float64", False), ("smooth", "float64", False), ("smooth", "float64", True)]
 GROUPS = [g for g in kernel_programs.GROUPS if "derivative" not in g and g != "gradients"]
 THOROUGH = [(group, dtype, xla) for group in GROUPS for dtype in ("float64", "float32") for xla in (False, True)]
-THOROUGH = [pytest.param(*case, marks=pytest.mark.thorough) for case in THOROUGH if case not in CASES]
+THOROUGH = [pytest.param(*case, marks=pytest.mark.thorough) for case in THOROUGH if case not in QUICK]
 
 SPOILT = np.arange(kernel_programs.LANES) % 8 == 3
 
@@ -41,38 +46,29 @@ def spoilt(batch: problems.Batch) -> problems.Batch:
     return replace(batch, **new)
 
 
-def answers(group: str, dtype: str, xla: bool, change: Callable[[problems.Batch], problems.Batch], monkeypatch) -> dict:
-    original = kernel_programs.batch
-    with monkeypatch.context() as patch:
-        patch.setattr(kernel_programs, "batch", lambda *args: change(original(*args)))
-        return (kernel_programs.answers_of_xla if xla else kernel_programs.answers)(group, dtype)
+def answers(group: str, dtype: str, xla: bool, batches: list[Change], monkeypatch) -> list[dict[str, np.ndarray]]:
+    """For every change of the batch; the programs are the same."""
+    original, found = kernel_programs.batch, []
+    jax.clear_caches()
+    with kernels.without() if xla else contextlib.nullcontext():
+        for change in batches:
+            monkeypatch.setattr(kernel_programs, "batch", lambda *args, change=change: change(original(*args)))
+            found.append(kernel_programs.answers(group, dtype))
+    jax.clear_caches()
+    return found
 
 
-@pytest.mark.parametrize(("group", "dtype", "xla"), CASES + THOROUGH)
-def test_neighbours_that_are_spoilt_change_nothing(group, dtype, xla, monkeypatch):
-    clean = answers(group, dtype, xla, lambda batch: batch, monkeypatch)
-    beside = answers(group, dtype, xla, spoilt, monkeypatch)
+@pytest.mark.parametrize(("group", "dtype", "xla"), QUICK + THOROUGH)
+def test_a_lane_is_as_beside_others_and_among_its_like(group, dtype, xla, monkeypatch):
+    """Neighbours that are spoilt change nothing; nor does a whole batch of the same grasp, for what is its own data."""
+    alike = [0, 3, 7, 11, 19, 27, 35, 43, 402] if group in ("plain", "smooth", "sets", "edges") else []
+    changes = [lambda batch, k=lane: spoilt(batch)[np.full(len(batch), k)] for lane in alike]
+    clean, beside, *alone = answers(group, dtype, xla, [lambda batch: batch, spoilt, *changes], monkeypatch)
     wrong = {name: kernel_programs.differing(x[~SPOILT], beside[name][~SPOILT]) for name, x in clean.items()}
     assert not {name: lanes for name, lanes in wrong.items() if len(lanes)}
-
-
-@pytest.mark.parametrize(
-    ("group", "dtype", "xla"),
-    [("smooth", "float64", False)]
-    + [
-        pytest.param(g, d, x, marks=pytest.mark.thorough)
-        for g in ("plain", "sets", "edges")
-        for d in ("float64", "float32")
-        for x in (False, True)
-    ],
-)
-def test_a_lane_in_company_is_as_among_its_like(group, dtype, xla, monkeypatch):
-    """A batch of one lane alone, again and again, has the shape of any other batch, and the same program."""
-    together = answers(group, dtype, xla, spoilt, monkeypatch)
-    for lane in (0, 3, 7, 11, 19, 27, 35, 43, 402):
-        alone = answers(group, dtype, xla, lambda batch, k=lane: spoilt(batch)[np.full(len(batch), k)], monkeypatch)
-        wrong = {name: kernel_programs.differing(x[lane : lane + 1], alone[name][:1]) for name, x in together.items()}
-        assert not {name: lanes for name, lanes in wrong.items() if len(lanes)}, lane
+    for lane, found in zip(alike, alone, strict=True):
+        differs = [n for n, x in beside.items() if len(kernel_programs.differing(x[lane : lane + 1], found[n][:1]))]
+        assert not differs, lane
 
 
 @pytest.mark.parametrize("disturbances", [jg.DisturbanceSet.forces(1.0), jg.DisturbanceSet.ball(1.0)])
