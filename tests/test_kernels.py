@@ -156,6 +156,21 @@ def test_the_setting(monkeypatch, tmp_path):
         kernels.usable()
 
 
+def test_vectors_are_as_long_as_asked_for(monkeypatch):
+    known = machine.with_vectors(None)
+    monkeypatch.setenv(machine.SETTING, "128")
+    short = machine.machine.__wrapped__()
+    assert short.vector_bytes == 16 and not short.estimates and not short.spoilt
+    # Kernels are kept by this.
+    assert (short.description == known.description) == (known.vector_bytes == 16)
+    monkeypatch.setenv(machine.SETTING, "64")
+    with pytest.raises(ValueError, match="JAXGRASP_VECTOR_BITS: got '64', wanted auto, 128, 256 or 512"):
+        machine.machine.__wrapped__()
+    if known.vector_bytes < 64:
+        with pytest.raises(machine.Unavailable, match="vectors of 512 bits are asked for"):
+            machine.with_vectors(512)
+
+
 def test_kernels_are_kept_on_disk(tmp_path):
     done = run(SMALL, XDG_CACHE_HOME=str(tmp_path))
     assert done.stdout.strip() == "12.0"

@@ -47,7 +47,7 @@ def machine() -> Machine:
     """
     asked = os.environ.get(SETTING, "auto")
     if asked not in ("auto", *map(str, _WITHOUT)):
-        raise ValueError(f"{SETTING}: got {asked!r}, wanted auto, {', '.join(map(str, _WITHOUT))}")
+        raise ValueError(f"{SETTING}: got {asked!r}, wanted auto, 128, 256 or 512")
     return with_vectors(None if asked == "auto" else int(asked))
 
 

@@ -1,0 +1,90 @@
+"""Kernels of every width that the processor can run, with spoilt memory, against each other and against XLA.
+
+Each program is called three times, with the other kernels of its group between the calls. Kernels of all widths do the
+same arithmetic in every lane, so their answers are equal to the last bit; AVX-512's estimates of reciprocals alone are
+others'. XLA's arithmetic is in another order.
+"""
+
+from __future__ import annotations
+
+import frame_reads
+import kernel_programs
+import kernel_targets
+import numpy as np
+import pytest
+
+CALLS = 3
+TARGETS = kernel_targets.targets()
+
+TOLERANCE = {"float64": 2e-8, "float32": 1e-4}
+"""Of margins, bounds, efforts and what is computed without iterations; the gap that solutions are accepted with."""
+
+POINTS = {"float64": 1e-5, "float32": 2e-2}
+"""Of forces and their derivatives, which gaps determine less well."""
+
+LOOSE = ("forces", "effort", "actuator", "blocking")
+
+NOISE = ("residual", "gap", "iterations", "multipliers")
+"""What rounding decides, or a gap of rounding: kernels agree with each other on it."""
+
+UNDECIDED = {"float64": 0.0, "float32": 0.005}
+"""Share of lanes whose status rounding may change."""
+
+QUICK = [("plain", "float64", True), ("plain", "float32", False), ("gradients", "float64", False)]
+"""Group, precision, and whether XLA is asked, too, which compiles for longer than all kernels together."""
+
+THOROUGH = [(group, dtype, True) for group in kernel_programs.GROUPS for dtype in TOLERANCE]
+THOROUGH = [pytest.param(*case, marks=pytest.mark.thorough) for case in THOROUGH if case not in QUICK]
+
+QUICK_TARGETS = [name for name in TARGETS if "halves" not in name or len(TARGETS) == 2]
+
+
+def rows(x: np.ndarray) -> np.ndarray:
+    return x.reshape(len(x), -1)
+
+
+def far(ours: np.ndarray, theirs: np.ndarray, tolerance: float) -> np.ndarray:
+    """The lanes that differ by more than the tolerance, of the lane's own size and of a usual lane's."""
+    a, b = rows(ours), rows(theirs)
+    known = np.isfinite(b)
+    size = np.where(known, np.abs(b), 0).max(1)
+    size = size + (np.median(size[size > 0]) if (size > 0).any() else 1)
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(a - b) <= tolerance * size[:, None]) | (a == b) | (np.isnan(a) & np.isnan(b))
+    return np.flatnonzero(~near.all(1))
+
+
+def hold_against_xla(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], dtype: str) -> None:
+    wrong: dict[str, list[int]] = {}
+    undecided = {name: np.flatnonzero(ours[name] != x) for name, x in theirs.items() if name.endswith("status")}
+    for name, lanes in undecided.items():
+        if len(lanes) > UNDECIDED[dtype] * kernel_programs.LANES:
+            wrong[name] = lanes.tolist()
+    for name, reference in theirs.items():
+        program, path = name.split(": ")
+        if reference.dtype.kind != "f" or any(word in path for word in NOISE):
+            continue
+        loose = any(word in name for word in LOOSE) or "derivative" in program
+        lanes = far(ours[name], reference, (POINTS if loose else TOLERANCE)[dtype])
+        lanes = np.setdiff1d(lanes, undecided.get(f"{program}: .status", []))
+        if len(lanes):
+            wrong[name] = lanes.tolist()
+    assert not wrong
+
+
+@pytest.mark.parametrize(("group", "dtype", "xla"), QUICK + THOROUGH)
+def test_every_lane_of_every_call_is_the_same_at_all_widths(group, dtype, xla):
+    theirs = kernel_programs.answers_of_xla(group, dtype) if xla else None
+    first: dict[bool, dict[str, np.ndarray]] = {}
+    for target in QUICK_TARGETS if (group, dtype, xla) in QUICK else TARGETS:
+        with kernel_targets.compiled_for(TARGETS[target]) as texts:
+            calls = [kernel_programs.answers(group, dtype) for _ in range(CALLS)]
+        assert texts, "nothing was compiled"
+        assert not [line for text in texts for line in frame_reads.unwritten(text)]
+        reference = first.setdefault(TARGETS[target].estimates, calls[0])
+        for number, call in enumerate(calls):
+            wrong = {name: d for name, x in call.items() if len(d := kernel_programs.differing(x, reference[name]))}
+            assert not wrong, f"{target}, call {number}"
+    if theirs is not None:
+        for ours in first.values():
+            hold_against_xla(ours, theirs, dtype)
