@@ -210,7 +210,7 @@ def _pack(code: VectorCode, source: str, lanes: list[str], count: int, kind: str
             gathered = code.emit(f"insertelement {code.types[byte]} {gathered}, {unit} {scalar}, i64 {lane}")
         if kind == "b":
             gathered = code.emit(f"icmp ne {code.types['byte']} {gathered}, zeroinitializer")
-        code.do(f"store {vector} {gathered}, ptr {code.entry(place, vector, entry)}")
+        code.store(kind, gathered, code.entry(place, code.kept[kind], entry))
 
     code.repeat(count, one)
     return place

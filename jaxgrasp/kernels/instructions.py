@@ -28,6 +28,8 @@ class Instructions:
         self.scalar = "double" if dtype.itemsize == 8 else "float"
         self.types = {"f": f"<{width} x {self.scalar}>", "i": f"<{width} x i32>", "b": f"<{width} x i1>", "u": "i64"}
         self.types["byte"] = f"<{width} x i8>"
+        # In memory a truth value is a byte: of a vector of bits that fill no byte, LLVM takes the others for zero.
+        self.kept = {**self.types, "b": self.types["byte"]}
         self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
         self.functions: list[tuple[str, list[str]]] = []
         self.lines: list[str] = []
@@ -63,17 +65,12 @@ class Instructions:
         """Memory in the frame for vectors; its name is for `pointer`."""
         self.count += 1
         name = f"%m{self.count}"
-        size = count * (
-            self.width * self.dtype.itemsize if kind == "f" else self.width * 4 if kind == "i" else self.width
-        )
         self.offsets[name] = self.used
-        self.used += -(-size // 64) * 64
+        self.used += -(-count * self.stride(kind) // 64) * 64
         return name
 
     def stride(self, kind: str) -> int:
         """Bytes from one vector of an array to the next."""
-        if kind == "b":
-            return -(-self.width // 8)
         return self.width * (self.dtype.itemsize if kind == "f" else 4 if kind == "i" else 1)
 
     def begin(self, signature: str) -> None:

@@ -213,15 +213,14 @@ class VectorCode(ValueCode):
 
     def store(self, kind: str, name: str, place: str) -> None:
         """Put a vector in memory."""
-        self.do(f"store {self.types[kind]} {name}, ptr {self.pointer(place)}, align {self.alignment(kind)}")
+        if kind == "b":
+            name = self.emit(f"sext {self.types['b']} {name} to {self.kept['b']}")
+        self.do(f"store {self.kept[kind]} {name}, ptr {self.pointer(place)}, align {self.stride(kind)}")
 
     def load(self, kind: str, place: str) -> str:
         """Read a vector."""
-        return self.emit(f"load {self.types[kind]}, ptr {self.pointer(place)}, align {self.alignment(kind)}")
-
-    def alignment(self, kind: str) -> int:
-        """Of vectors in memory, in bytes."""
-        return 1 if kind == "b" else self.width * (self.dtype.itemsize if kind == "f" else 4)
+        name = self.emit(f"load {self.kept[kind]}, ptr {self.pointer(place)}, align {self.stride(kind)}")
+        return self.emit(f"icmp slt {self.kept['b']} {name}, zeroinitializer") if kind == "b" else name
 
     def store_where(self, mask: str | None, new: str, slot: str, kind: str) -> None:
         """Put a vector in memory, where the mask holds."""
@@ -249,9 +248,7 @@ class VectorCode(ValueCode):
 
     def load_own(self, kind: str, number: int, index: tuple) -> str:
         """A different number for every lane."""
-        return self.emit(
-            f"load {self.types[kind]}, ptr {self.place(index, self.types[kind], self.own[number])}, align 64"
-        )
+        return self.load(kind, self.place(index, self.kept[kind], self.own[number]))
 
     def load_shared(self, kind: str, number: int, index: tuple) -> str:
         """The same number for all lanes."""

@@ -52,7 +52,10 @@ each:
   %target.p = getelementptr i64, ptr %targets, i64 %k
   %source = load i64, ptr %source.p
   %target = load i64, ptr %target.p
-@COPY@
+  %from.p = getelementptr @UNIT@, ptr %from, i64 %source
+  %to.p = getelementptr @UNIT@, ptr %to, i64 %target
+  %value = load @UNIT@, ptr %from.p
+  store @UNIT@ %value, ptr %to.p
   %k.next = add i64 %k, 1
   %again = icmp ult i64 %k.next, %lanes
   br i1 %again, label %each, label %moved
@@ -63,24 +66,6 @@ out:
   ret void
 }
 """
-
-_COPY = """  %from.p = getelementptr @UNIT@, ptr %from, i64 %source
-  %to.p = getelementptr @UNIT@, ptr %to, i64 %target
-  %value = load @UNIT@, ptr %from.p
-  store @UNIT@ %value, ptr %to.p"""
-
-_COPY_BIT = """  %bits = load i@BITS@, ptr %from
-  %old = load i@BITS@, ptr %to
-  %down.by = trunc i64 %source to i@BITS@
-  %up.by = trunc i64 %target to i@BITS@
-  %down = lshr i@BITS@ %bits, %down.by
-  %bit = and i@BITS@ %down, 1
-  %up = shl i@BITS@ %bit, %up.by
-  %mark = shl i@BITS@ 1, %up.by
-  %others = xor i@BITS@ %mark, -1
-  %left = and i@BITS@ %old, %others
-  %new = or i@BITS@ %left, %up
-  store i@BITS@ %new, ptr %to"""
 
 _TOGETHER = """
 @TABLES@
@@ -196,7 +181,7 @@ def blocks(code: VectorCode) -> str:
         return _ALONE.replace("@ROUNDS@", _ROUNDS if code.main else "")
     width, few = code.width, code.width // 4
     values = {
-        "@MOVES@": _moves(width),
+        "@MOVES@": _moves(),
         "@TABLES@": _tables(code),
         "@FEW@": str(few),
         "@ALMOST@": str(width - few),
@@ -210,18 +195,17 @@ def blocks(code: VectorCode) -> str:
     return text
 
 
-def _moves(width: int) -> str:
+def _moves() -> str:
     """How a lane's data are copied to another one: numbers, integers and truth values."""
-    bits = _COPY_BIT.replace("@BITS@", str(max(8, width)))
-    copies = {"words": _COPY.replace("@UNIT@", "i32"), "longs": _COPY.replace("@UNIT@", "i64"), "flags": bits}
-    return "".join(_MOVE.replace("@COPY@", copy).replace("@TABLE@", name) for name, copy in copies.items())
+    units = {"words": "i32", "longs": "i64", "flags": "i8"}
+    return "".join(_MOVE.replace("@UNIT@", unit).replace("@TABLE@", name) for name, unit in units.items())
 
 
 def _tables(code: VectorCode) -> str:
     """Where a lane's data lie in a frame: offsets of numbers, of integers and of truth values."""
-    sizes = {"f": code.dtype.itemsize, "i": 4, "b": 0}
+    sizes = {"f": code.dtype.itemsize, "i": 4, "b": 1}
     lines = []
-    for name, size in (("words", 4), ("longs", 8), ("flags", 0)):
+    for name, size in (("words", 4), ("longs", 8), ("flags", 1)):
         offsets = sorted(offset for offset, kind in code.live.items() if sizes[kind] == size)
         entries = ", ".join(f"i32 {offset}" for offset in offsets or [0])
         lines.append(f"@{name} = internal constant [{max(1, len(offsets))} x i32] [{entries}]")
