@@ -38,7 +38,14 @@ _EFFORT_SETTINGS = {
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
     ),
     "float32": Settings(
-        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=5
+        tolerance=1e-4,
+        max_iterations=40,
+        step_cap=1e-3,
+        mu_floor=1e-10,
+        equal_steps=True,
+        safeguard=1e-3,
+        patience=5,
+        gap_share=0.1,
     ),
 }
 # A gap that did not close to the tolerance still counts as solved below this one.
