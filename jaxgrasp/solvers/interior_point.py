@@ -161,7 +161,9 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         if settings.gap_share:
             wanted = settings.gap_share * settings.tolerance * problem.gap_scale(carry.record)
             least = jnp.maximum(least, wanted * inverse_count)
-        stepped, mu = _predict_correct(problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count, least)
+        stepped, mu = _predict_correct(
+            problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count, least
+        )
         active = carry.active
         take = active & jnp.isfinite(mu)
         iterate = _where(take, stepped, carry.iterate)
