@@ -1,13 +1,13 @@
 """What the solver's best points are worth in the equality rows as they came, before these were made orthonormal.
 
-The solver works with E = T N, orthonormal combinations of the rows N of G (and of J'f - B u). In floating point E is off
-T N by about eps over what was left of the shortest row, which the solver cannot see. So in the end points are moved onto
-N x = b itself, and with w = T'y the upper bound is taken anew,
+The solver works with E = T N, orthonormal combinations of the rows N of G (and of J'f - B u). In floating point E is
+off T N by about eps over what was left of the shortest row, which the solver cannot see. So in the end points are moved
+onto N x = b itself, and with w = T'y the upper bound is taken anew,
 
     lambda* <= [h'z + b'w + radius |A'z + N'w|_1 + e] / sigma'z,
 
-with what rounding can have done to it: e is eps times the same sums over absolute values, which is twice what every term
-may have lost; signs being random, longer sums lose no more. sigma is off by about eps over what was left of the shortest
+with what rounding can have done to it: e is eps times the same sums over absolute values, twice what every term may
+have lost; signs being random, longer sums lose no more. sigma is off by about eps over what was left of the shortest
 row of G, as the pseudo-inverse is, and lambda* with it.
 """
 

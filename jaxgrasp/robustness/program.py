@@ -21,7 +21,7 @@ from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.fence import fenced
 from jaxgrasp.robustness.efforts import EffortRows, effort_unit, joined_rows, packed, unpacked
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.worst_case import reaches_outside, worst_rows
+from jaxgrasp.robustness.worst_case import reach_outside, worst_rows
 from jaxgrasp.solvers.block_kkt import Blocks, Record, Rows, total
 from jaxgrasp.solvers.interior_point import Iterate
 
@@ -201,7 +201,9 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         wrench = jnp.concatenate([wrench, jnp.zeros_like(sizes)])
     coordinates, kept = rows.coordinates(wrench), rows.kept
     largest = fold(jnp.maximum, jnp.abs(wrench))
-    outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > 10 * RANK_TOLERANCE[dtype.name] * largest
+    tolerance = 10 * RANK_TOLERANCE[dtype.name]
+    outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > tolerance * largest
+    reach = reach_outside(grasps, basis)
     return Program(
         cone_edges=cone_edges,
         columns=columns,
@@ -218,9 +220,9 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         mean=mean,
         rank=fold(jnp.add, basis.kept[:6]).astype(jnp.int32),
         least_ratio=fold(jnp.minimum, jnp.where(basis.kept > 0, basis.ratios, 1)[:6]),
-        doubtful=_doubtful(grasps, basis),
+        doubtful=_doubtful(grasps, basis, reach, tolerance),
         undisturbed=undisturbed,
-        disturbance_outside=reaches_outside(grasps, basis),
+        disturbance_outside=reach > tolerance,
         wrench_outside=outside,
         slippery=((grasps.friction <= 0) & (fold(jnp.maximum, cone) > 0)).any(0),
         efforts=efforts,
@@ -246,16 +248,18 @@ def actuated_values(
     }
 
 
-def _doubtful(grasps: Grasps, basis: Basis) -> jax.Array:
-    """Where float32 cannot tell the rank, or the pseudo-inverse is off by what rounding makes of a short row.
+def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) -> jax.Array:
+    """Where float32 cannot tell the rank, or what is in the range, or rounding makes much of a short row.
 
     A row that is nearly dependent makes S_1 and S_2 wrong by eps over what was left of it. One that was dropped may be
-    dependent or not, unless the contacts themselves say so: all on one line, to the last bit. Rows of joints that no
-    actuator reaches come without that knowledge. float64 is fine enough to decide.
+    dependent or not, unless the contacts themselves say so: all on one line, to the last bit. A disturbance set that
+    leaves the range by little more than rounding has margin 0, or none of it at all. Rows of joints that no actuator
+    reaches are dependent where they look so. float64 is fine enough to decide.
     """
     ratios, kept = basis.ratios, basis.kept > 0
     if ratios.dtype == jnp.float64:
         return jnp.zeros(ratios.shape[1:], bool)
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
     unreached = ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)
-    return short | (~kept[:6].all(0) & ~grasps.lined) | unreached
+    inside = reach <= 64 * jnp.finfo(reach.dtype).eps
+    return short | (~kept[:6].all(0) & ~grasps.lined) | unreached | ~inside & (reach <= tolerance)
