@@ -117,6 +117,8 @@ def over_grasps(
             given[name] = as_float(name, value, ())
     if actuation is not None and not isinstance(actuation, Actuation):
         raise ValueError(f"actuation: got {type(actuation).__name__}, wanted jaxgrasp.Actuation")
+    if actuation is not None and not actuation.transmission.shape[-1]:
+        raise ValueError("actuation: got no actuators, wanted at least one; leave it out and fingers push at will")
     given["actuation"] = actuation
     return _run(kernel, contacts, disturbances, given)
 

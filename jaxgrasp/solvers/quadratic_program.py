@@ -40,8 +40,8 @@ class QPSolution:
     y: jax.Array
     """(*batch, p): multipliers of Ax = b; if INFEASIBLE part of a certificate (y, z): A'y + G'z = 0, b'y + h'z = -1."""
     z: jax.Array
-    """(*batch, m): multipliers of Gx <= h, z >= 0, 0 where h is infinite; if INFEASIBLE part of that certificate; y and z
-    are NaN where a side of -inf needs none."""
+    """(*batch, m): multipliers of Gx <= h, z >= 0, 0 where h is infinite; if INFEASIBLE part of that certificate, which
+    is NaN where a side is -inf."""
     objective: jax.Array
     """(*batch,): 1/2 x'Px + q'x; inf if INFEASIBLE, -inf if UNBOUNDED."""
     status: jax.Array
