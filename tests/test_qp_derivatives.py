@@ -98,7 +98,7 @@ def test_lanes_without_a_solution_have_zero_gradients_and_touch_no_neighbour():
     alone = reverse(tuple(data), weights())
     broken = [v.copy() for v in data]
     broken[1][0, 1] = np.nan
-    broken[5][1, 0] = np.inf
+    broken[3][1, 0] = np.inf
     broken[0][2] = -np.eye(N)
     broken[4][3, :2], broken[5][3, :2] = [[1, 0, 0, 0], [-1, 0, 0, 0]], -1.0
     broken[0][4], broken[1][4], broken[4][4] = 0, [-1, 0, 0, 0], 0
@@ -132,6 +132,20 @@ def test_repeated_rows_share_the_derivative_of_one():
         np.testing.assert_allclose(found[k], expected[k], rtol=1e-6, atol=1e-6)
     for k in (4, 5):
         np.testing.assert_allclose(found[k][:, [0, 5, 6]].sum(1), expected[k][:, 0], rtol=1e-6, atol=1e-6)
+
+
+def test_missing_sides_vary_nothing():
+    """A row whose side is infinite has no derivatives; those of everything else are as without it."""
+    data = programs(False, 6)
+    without, missing = [v.copy() for v in data], [v.copy() for v in data]
+    without[4][:, 0], without[5][:, 0], missing[5][:, 0] = 0, 1, np.inf
+    on_x = tuple(w if k in (0, 4) else 0 * w for k, w in enumerate(weights()))
+    expected, found = (reverse(tuple(each), on_x) for each in (without, missing))
+    for part, other in zip(found[:4], expected[:4], strict=True):
+        np.testing.assert_allclose(part, other, rtol=1e-6, atol=1e-6)
+    for part, other in zip(found[4:], expected[4:], strict=True):
+        np.testing.assert_array_equal(part[:, 0], 0)
+        np.testing.assert_allclose(part[:, 1:], other[:, 1:], rtol=1e-6, atol=1e-6)
 
 
 def test_dependent_equalities():

@@ -146,7 +146,7 @@ def test_neighbours_do_not_touch_each_other():
     base = small()
     lanes = [np.stack([v] * 6) for v in base]
     lanes[1][1, 0] = np.nan
-    lanes[5][2, 0] = np.inf
+    lanes[5][2, 0] = np.nan
     lanes[0][3] = -np.eye(2)
     lanes[3][4] = -1.0
     answer = solve(*lanes)
@@ -162,6 +162,65 @@ def test_neighbours_do_not_touch_each_other():
     np.testing.assert_array_equal(answer.x[0], answer.x[5])
     assert np.isnan(answer.x[1:4]).all() and np.isnan(answer.objective[1:4]).all()
     assert (answer.iterations[1:4] == 0).all()
+
+
+def boxed(dtype="float64"):
+    """Random programs -1 <= G x <= 2, as [G; -G] x <= [2; 1], and where a side is missing; no x grows without bound."""
+    rng = np.random.default_rng(3)
+    root, G = rng.normal(size=(LANES, 4, 4)), rng.normal(size=(LANES, 6, 4))
+    P, q = root @ root.swapaxes(1, 2) + 0.1 * np.eye(4), rng.normal(size=(LANES, 4))
+    G, h = np.concatenate([G, -G], 1), np.repeat([[2.0] * 6 + [1.0] * 6], LANES, 0) * rng.uniform(0.1, 1, (LANES, 12))
+    return [v.astype(dtype) for v in (P, q, G, h)], rng.random((LANES, 12)) < 0.4
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_an_infinite_side_is_no_row(dtype):
+    (P, q, G, h), missing = boxed(dtype)
+    missing[0] = True
+    for infinite in (np.inf, 1e20, 1e30):
+        answer = solve(P, q, None, None, G, np.where(missing, infinite, h).astype(dtype))
+        for lane, one in enumerate(lanes_of(answer)):
+            there = ~missing[lane]
+            expected = clarabel_objective(
+                P[lane], q[lane], np.zeros((0, 4)), np.zeros(0), G[lane, there], h[lane, there]
+            )
+            assert one.status == Status.SOLVED
+            assert one.objective == pytest.approx(expected, rel=ERROR[dtype], abs=ERROR[dtype])
+            assert (one.z[~there] == 0).all() and np.isinf(one.s[~there]).all() and np.isfinite(one.s[there]).all()
+
+
+@pytest.mark.parametrize("far", [1e6, 1e12, 1e19])
+def test_a_side_that_is_far_away_does_no_harm(far):
+    (P, q, G, h), missing = boxed()
+    near, away = (solve(P, q, None, None, G, np.where(missing, side, h)) for side in (np.inf, far))
+    assert (away.status == Status.SOLVED).all()
+    np.testing.assert_allclose(away.x, near.x, atol=ERROR["float64"])
+
+
+def test_linear_programs_with_missing_sides_against_highs():
+    """x = 0 is admissible: what HiGHS does not solve is unbounded, or the solver says that it did not come so far."""
+    (_, q, G, h), missing = boxed()
+    answer, solved = solve(None, q, None, None, G, np.where(missing, np.inf, h)), 0
+    for lane, one in enumerate(lanes_of(answer)):
+        there = ~missing[lane]
+        expected = linprog(q[lane], G[lane, there], h[lane, there], bounds=(None, None))
+        if expected.status == 0:
+            solved += 1
+            assert one.status == Status.SOLVED
+            assert one.objective == pytest.approx(expected.fun, rel=OBJECTIVE, abs=OBJECTIVE)
+        else:
+            assert one.status in (Status.UNBOUNDED, Status.MAX_ITERATIONS)
+    assert 0 < solved < LANES
+
+
+def test_a_side_that_nothing_meets():
+    P, q, A, b, G, h = small()
+    sides = np.array([[0.0, 0.0], [0.0, -np.inf], [0.0, -1e20], [np.nan, -np.inf], [0.0, np.nan]])
+    answer = solve(P, q, A, b, G, sides)
+    names = [Status(int(code)).name for code in answer.status]
+    assert names == ["SOLVED", "INFEASIBLE", "INFEASIBLE", "INVALID_INPUT", "INVALID_INPUT"]
+    assert np.isnan(answer.x[1:]).all() and np.isnan(answer.z[1:]).all() and np.isinf(answer.objective[1:3]).all()
+    np.testing.assert_array_equal(answer.x[0], solve(*small()).x)
 
 
 @pytest.mark.parametrize("units", [1e-4, 1e4])

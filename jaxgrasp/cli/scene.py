@@ -139,6 +139,8 @@ class Scene(HandScene):
         from jaxgrasp.ranking.configurations import candidates_of, kept
 
         columns: dict[str, np.ndarray] = {}
+        if self.actuators and not len(hand.actuators):
+            print("jaxgrasp: the hand has no actuators: every contact may push with --max-force", file=sys.stderr)
         if self.qpos is None:
             from jaxgrasp.hands import sample_configurations
 
@@ -151,7 +153,7 @@ class Scene(HandScene):
                 hand,
                 qpos,
                 source=self.scene if self.qpos is None else str(self.qpos),
-                limited=self.actuators,
+                limited=self.actuators and len(hand.actuators) > 0,
                 columns=columns,
                 progress=progress,
             )

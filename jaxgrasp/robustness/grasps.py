@@ -45,6 +45,8 @@ class Grasps:
     """(6, *lanes), what turns wrenches in N and N m to newtons: 1 and 1 / length."""
     columns: jax.Array
     """(6, 3, n, *lanes), the blocks of G; zero where absent."""
+    lined: jax.Array
+    """bool (*lanes), all contacts are on one line, exactly: two of them always are. G has rank 5 at most."""
     wrench: jax.Array
     """(6, *lanes), b, N."""
     reserve: jax.Array
@@ -115,6 +117,8 @@ def over_grasps(
             given[name] = as_float(name, value, ())
     if actuation is not None and not isinstance(actuation, Actuation):
         raise ValueError(f"actuation: got {type(actuation).__name__}, wanted jaxgrasp.Actuation")
+    if actuation is not None and not actuation.transmission.shape[-1]:
+        raise ValueError("actuation: got no actuators, wanted at least one; leave it out and fingers push at will")
     given["actuation"] = actuation
     return audited(kernel, _run(kernel, contacts, disturbances, given), contacts, disturbances, given)
 
@@ -202,6 +206,7 @@ def admitted(arguments: Arguments, raw: dict[str, jax.Array]) -> Grasps:
         length=length,
         units=units,
         columns=grasp_columns(positions / length, frames),
+        lined=_lined(positions, there),
         wrench=wrench * units,
         reserve=jnp.where(valid, raw["reserve"], 0),
         terms=terms,
@@ -215,6 +220,22 @@ def admitted(arguments: Arguments, raw: dict[str, jax.Array]) -> Grasps:
         cutoff=raw.get("cutoff"),
         actuated=_actuated(raw, there, valid, length, friction, max_force) if "jacobian" in raw else None,
     )
+
+
+def _lined(positions: jax.Array, there: jax.Array) -> jax.Array:
+    """Whether the points (3, n, *lanes) that are there lie on one line.
+
+    Products are compared, not subtracted: a difference of products may be rounded once or twice, as compilers like.
+    """
+    first, far = positions[:, 0], jnp.zeros_like(positions[:, 0])
+    for i in range(1, positions.shape[1]):
+        first = jnp.where(there[:i].any(0), first, positions[:, i])
+    apart = jnp.where(there, positions - first[:, None], 0)
+    for i in range(positions.shape[1]):
+        further = fold(jnp.maximum, jnp.abs(apart[:, i])) > fold(jnp.maximum, jnp.abs(far))
+        far = jnp.where(further, apart[:, i], far)
+    along = [apart[a] * far[(a + 1) % 3] == apart[(a + 1) % 3] * far[a] for a in range(3)]
+    return fold(jnp.logical_and, [row.all(0) for row in along])
 
 
 def _sound_actuation(raw: dict[str, jax.Array], active: jax.Array) -> jax.Array:

@@ -10,7 +10,7 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.program import Program
 from jaxgrasp.solvers.block_kkt import Blocks, Rows
-from jaxgrasp.solvers.effort_problem import EffortProblem
+from jaxgrasp.solvers.effort_problem import EffortProblem, least_curvature
 from jaxgrasp.solvers.margin_problem import MarginProblem
 
 _REFINEMENTS = {"float64": 0, "float32": 1}
@@ -46,14 +46,16 @@ def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort
     def held(group: Blocks, hessian: jax.Array) -> Blocks:
         return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * wanted, hessian=hessian)
 
+    # The actuators' efforts cost nothing.
+    groups = (held(blocks, root / largest), *[held(g, jnp.zeros_like(g.present)[None, None]) for g in others])
     problem = EffortProblem(
-        # The actuators' efforts cost nothing.
-        (held(blocks, root / largest), *[held(g, jnp.zeros_like(g.present)[None, None]) for g in others]),
+        groups,
         program.rhs,
         program.dropped,
         program.radius,
         _REFINEMENTS[dtype.name],
         guess,
+        tuple(least_curvature(g.hessian) for g in groups),
     )
     return Effort(problem, wanted, largest)
 

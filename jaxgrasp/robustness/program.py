@@ -8,6 +8,7 @@ are dropped.
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +21,28 @@ from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.fence import fenced
 from jaxgrasp.robustness.efforts import EffortRows, effort_unit, joined_rows, packed, unpacked
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.worst_case import reaches_outside, worst_rows
-from jaxgrasp.solvers.block_kkt import Blocks, Record, Rows
+from jaxgrasp.robustness.worst_case import reach_outside, worst_rows
+from jaxgrasp.solvers.block_kkt import Blocks, Record, Rows, total
 from jaxgrasp.solvers.interior_point import Iterate
 
 # Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
 LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
+
+
+class Equalities(NamedTuple):
+    """Rows of G f = b, and of J'f - B u = 0, for scaled unknowns: forces in units of `Program.mean`.
+
+    columns: (eq, k, n, *lanes) a group.
+    wrench: (eq, *lanes), the right-hand side.
+    """
+
+    columns: Rows
+    wrench: jax.Array
+
+    def equality(self, x: Rows) -> jax.Array:
+        """N x, (eq, *lanes)."""
+        products = [total(jnp.moveaxis(c * x_g, 0, 2)) for c, x_g in zip(self.columns, x, strict=True)]
+        return fold(jnp.add, products)
 
 
 @jax.tree_util.register_dataclass
@@ -53,14 +70,18 @@ class Program:
     """mu F, (n, *lanes), N."""
     normal: jax.Array
     """F, (n, *lanes), N."""
+    given: "Equalities"
+    """The equality rows as they came, before `columns` were made of them."""
     basis: Basis
     """Row operations from the rows in newtons to the orthonormal ones, for forces in units of `mean`."""
     mean: jax.Array
     """Mean of F, (*lanes), N."""
     rank: jax.Array
     """Rank of G, (*lanes)."""
+    least_ratio: jax.Array
+    """What was left of the shortest row of G that counts, in lengths of the longest, (*lanes)."""
     doubtful: jax.Array
-    """bool (*lanes): the rank cannot be told in this precision."""
+    """bool (*lanes): float32 cannot tell the rank."""
     undisturbed: jax.Array
     """bool (*lanes): S_1 = S_2 = 0."""
     disturbance_outside: jax.Array
@@ -110,16 +131,18 @@ class Program:
 
     def wrench_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
         """Multipliers of G f = b (6, *lanes) from those of the orthonormal rows, per unit of the scaled objective."""
-        return self._row_multipliers(y)[:6] * units
+        return self.row_multipliers(y)[:6] / self.mean * units
 
     def joint_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array | None:
         """The same of J'f - B u = 0, (n_v, *lanes)."""
-        return None if self.joint_sizes is None else self._row_multipliers(y)[6:] / self.joint_sizes * units[5]
+        if self.joint_sizes is None:
+            return None
+        return self.row_multipliers(y)[6:] / self.mean / self.joint_sizes * units[5]
 
-    def _row_multipliers(self, y: jax.Array) -> jax.Array:
+    def row_multipliers(self, y: jax.Array) -> jax.Array:
+        """T'y, (eq, *lanes): multipliers of the rows as they came from those of the orthonormal ones."""
         kept = self.basis.kept * y
-        terms = [row * k for row, k in zip(self.basis.operations, kept, strict=True)]
-        return fold(jnp.add, terms) / self.mean
+        return fold(jnp.add, [row * k for row, k in zip(self.basis.operations, kept, strict=True)])
 
     def wrench_multipliers_adjoint(self, y: jax.Array, units: jax.Array) -> jax.Array:
         """The transpose of `wrench_multipliers`."""
@@ -166,18 +189,21 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
     scales = jnp.stack([tangential, tangential, normal]) / mean
     wrench = grasps.wrench / mean
     if grasps.actuated is None:
-        rows = whitened(grasps.columns * scales)
+        given = (grasps.columns * scales,)
+        rows = whitened(given[0])
         columns, efforts, sizes = rows.rows, None, None
     else:
         joined = joined_rows(grasps.actuated, grasps.columns * scales, scales, unit / mean)
-        rows, sizes = whitened(packed(joined)), joined.sizes
+        rows, sizes, given = whitened(packed(joined)), joined.sizes, (joined.forces, joined.efforts)
         columns, effort_columns = unpacked(rows.rows, present.shape[0], unit.shape[0])
         limits = jnp.stack([grasps.actuated.upper, -grasps.actuated.lower]) / unit
         efforts = EffortRows(effort_columns, sigmas[1], limits, unit)
         wrench = jnp.concatenate([wrench, jnp.zeros_like(sizes)])
     coordinates, kept = rows.coordinates(wrench), rows.kept
     largest = fold(jnp.maximum, jnp.abs(wrench))
-    outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > 10 * RANK_TOLERANCE[dtype.name] * largest
+    tolerance = 10 * RANK_TOLERANCE[dtype.name]
+    outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > tolerance * largest
+    reach = reach_outside(grasps, basis)
     return Program(
         cone_edges=cone_edges,
         columns=columns,
@@ -189,12 +215,14 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         scale=scale,
         tangential=tangential,
         normal=normal,
+        given=Equalities(given, wrench),
         basis=rows,
         mean=mean,
         rank=fold(jnp.add, basis.kept[:6]).astype(jnp.int32),
-        doubtful=_doubtful(basis),
+        least_ratio=fold(jnp.minimum, jnp.where(basis.kept > 0, basis.ratios, 1)[:6]),
+        doubtful=_doubtful(grasps, basis, reach, tolerance),
         undisturbed=undisturbed,
-        disturbance_outside=reaches_outside(grasps, basis),
+        disturbance_outside=reach > tolerance,
         wrench_outside=outside,
         slippery=((grasps.friction <= 0) & (fold(jnp.maximum, cone) > 0)).any(0),
         efforts=efforts,
@@ -220,9 +248,18 @@ def actuated_values(
     }
 
 
-def _doubtful(basis: Basis) -> jax.Array:
-    """A row between clearly dependent and clearly independent; float64 is fine enough to decide."""
-    ratios = basis.ratios
+def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) -> jax.Array:
+    """Where float32 cannot tell the rank, or what is in the range, or rounding makes much of a short row.
+
+    A row that is nearly dependent makes S_1 and S_2 wrong by eps over what was left of it. One that was dropped may be
+    dependent or not, unless the contacts themselves say so: all on one line, to the last bit. A disturbance set that
+    leaves the range by little more than rounding has margin 0, or none of it at all. Rows of joints that no actuator
+    reaches are dependent where they look so. float64 is fine enough to decide.
+    """
+    ratios, kept = basis.ratios, basis.kept > 0
     if ratios.dtype == jnp.float64:
         return jnp.zeros(ratios.shape[1:], bool)
-    return ((ratios > 1e-5) & (ratios < 1e-3)).any(0)
+    short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
+    unreached = ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)
+    inside = reach <= 64 * jnp.finfo(reach.dtype).eps
+    return short | (~kept[:6].all(0) & ~grasps.lined) | unreached | ~inside & (reach <= tolerance)

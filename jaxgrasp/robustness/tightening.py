@@ -18,6 +18,7 @@ from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited
 from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge
 from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
+from jaxgrasp.robustness.certificates import balanced, certified
 from jaxgrasp.robustness.derivatives import CentralPoint, Point, central_kappa, centred, envelope_adjoint
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
@@ -42,7 +43,14 @@ _EFFORT_SETTINGS = {
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
     ),
     "float32": Settings(
-        tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=5
+        tolerance=1e-4,
+        max_iterations=40,
+        step_cap=1e-3,
+        mu_floor=1e-10,
+        equal_steps=True,
+        safeguard=1e-3,
+        patience=5,
+        gap_share=0.1,
     ),
 }
 # A gap that did not close to the tolerance still counts as solved below this one.
@@ -270,17 +278,23 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, I
     problem = margin_problem(program, grasps.cutoff)
     settings = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
+    point = balanced(program, problem, outcome.record.x)
+    low, high = problem.attained(point.x), certified(program, problem, outcome.record)
     # Without a load, no forces at all are an answer with margin 0, exactly.
+    accepted = _ACCEPTED_GAP[dtype.name]
+    nothing = (low < 8 * jnp.finfo(dtype).eps) | ~point.exact & (low <= accepted)
     flat = program.disturbance_outside | program.slippery
-    idle = ((outcome.record.lower < 0) | flat) & _unloaded(grasps, program)
-    record = outcome.record._replace(
-        lower=jnp.where(idle, 0, outcome.record.lower),
-        x=tuple(jnp.where(idle, 0, x) for x in outcome.record.x),
-    )
-    low, high = record.lower, record.upper
+    idle = (nothing | flat) & _unloaded(grasps, program)
+    low, exact = jnp.where(idle, 0, low), point.exact | idle
     size = jnp.maximum(1, jnp.abs(low))
-    closed = high - low <= _ACCEPTED_GAP[dtype.name] * jnp.where(jnp.isinf(low), 1, size)
-    bearable = low >= -settings.tolerance
+    # The solver's own bound tells how far it came, the other one whether its rows were the right ones.
+    came = jnp.where(jnp.isinf(low), 1, size)
+    apart = lambda upper, unit: jnp.abs(upper - low) <= accepted * unit  # noqa: E731
+    closed = exact & apart(outcome.record.upper, came) & apart(high, jnp.maximum(came, program.mean / program.scale))
+    # Where bounds cross, rounding made one of them false: less is attained in any case, and more is certain.
+    low, high = jnp.minimum(low, high), jnp.maximum(low, high)
+    record = outcome.record._replace(lower=low, upper=high, x=tuple(jnp.where(idle, 0, x) for x in point.x))
+    bearable = exact & (low >= -settings.tolerance)
     pruned = jnp.zeros_like(bearable) if problem.cutoff is None else high < problem.cutoff
 
     margin, upper = low * program.scale, high * program.scale
@@ -291,14 +305,16 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, I
     margin = jnp.where(hopeless & ~closed | pruned & jnp.isinf(low), jnp.nan, margin)
     decided = [
         (~grasps.valid, Status.INVALID_INPUT, jnp.nan),
+        (program.doubtful & program.wrench_outside, Status.ILL_CONDITIONED, jnp.nan),
         (program.wrench_outside, Status.INFEASIBLE, jnp.nan),
+        (program.doubtful & program.disturbance_outside & bearable, Status.ILL_CONDITIONED, 0.0),
         (program.disturbance_outside & bearable, Status.SOLVED, 0.0),
         (program.undisturbed & bearable, Status.UNBOUNDED, jnp.inf),
         ((program.disturbance_outside | program.undisturbed) & hopeless, Status.INFEASIBLE, jnp.nan),
     ]
     status = jnp.select(
-        [c for c, _, _ in decided] + [hopeless, bearable & closed, pruned, program.doubtful],
-        [s for _, s, _ in decided] + [Status.INFEASIBLE, Status.SOLVED, Status.PRUNED, Status.ILL_CONDITIONED],
+        [c for c, _, _ in decided] + [hopeless, program.doubtful, bearable & closed, pruned],
+        [s for _, s, _ in decided] + [Status.INFEASIBLE, Status.ILL_CONDITIONED, Status.SOLVED, Status.PRUNED],
         Status.MAX_ITERATIONS,
     ).astype(jnp.int32)
     margin = jnp.select([c for c, _, _ in decided], [jnp.full_like(low, m) for *_, m in decided], margin)
@@ -360,7 +376,7 @@ def _at_centre(grasps: Grasps, program: Program, iterate: Iterate, solution: Sol
     kept = {
         name: jnp.where(found, value, getattr(solution, name)) for name, value in values.items() if value is not None
     }
-    proven = solution.status == Status.INFEASIBLE
+    proven = (solution.status == Status.INFEASIBLE) | (solution.status == Status.ILL_CONDITIONED)
     status = jnp.where(found & ~proven, Status.SOLVED, solution.status)
     status = jnp.where(possible & ~found & ~proven, Status.MAX_ITERATIONS, status)
     return replace(solution, **kept, status=status)
@@ -386,22 +402,27 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     share = (wanted - attained) / jnp.maximum(record.lower - attained, 1e-3)
     share = 0.5 * (1 + jnp.where(jnp.isfinite(attained), jnp.clip(share, 0, 1), 0))
     problem = replace(problem, guess=tuple(share * x + (1 - share) * c for x, c in zip(record.x, centre, strict=True)))
-    active = grasps.valid & ~program.wrench_outside & held & (first.status != Status.INFEASIBLE)
+    hopeless = first.status == Status.INFEASIBLE
+    active = grasps.valid & ~program.wrench_outside & held & ~hopeless
     # Without a load and a margin no forces at all are the answer, exactly.
     idle = active & _unloaded(grasps, program) & (wanted == 0)
     outcome = interior_point.solve(problem, settings, active & ~idle)
     best = jax.tree.map(lambda x: jnp.where(idle, 0, x), outcome.record)
-    gap = (best.upper - best.lower) / problem.gap_scale(best)
-    closed = gap <= _ACCEPTED_GAP[dtype.name]
+    point = balanced(program, problem, best.x)
+    best = best._replace(x=tuple(jnp.where(idle, 0, x) for x in point.x))
+    gap, accepted = (best.upper - best.lower) / problem.gap_scale(best), _ACCEPTED_GAP[dtype.name]
+    attained = largest.attained(best.x)
+    kept = program.undisturbed | (attained >= wanted - accepted * jnp.maximum(1, wanted))
+    closed = kept & point.exact & (jnp.abs(gap) <= accepted)
 
+    out_of_reach = hopeless | ~reachable & ~program.undisturbed
     status = jnp.select(
-        [~grasps.valid, ~active, closed, program.doubtful],
-        [Status.INVALID_INPUT, Status.INFEASIBLE, Status.SOLVED, Status.ILL_CONDITIONED],
+        [~grasps.valid, hopeless, program.doubtful, out_of_reach, active & closed],
+        [Status.INVALID_INPUT, Status.INFEASIBLE, Status.ILL_CONDITIONED, Status.INFEASIBLE, Status.SOLVED],
         Status.MAX_ITERATIONS,
     ).astype(jnp.int32)
     answered = active & jnp.isfinite(best.upper)
     hide = lambda x: jnp.where(answered, x, jnp.nan)  # noqa: E731
-    attained = largest.attained(best.x)
     attained = jnp.where(program.undisturbed, jnp.inf, attained * program.scale)
     attained = jnp.where(program.disturbance_outside | program.slippery, 0, attained)
     forces = program.forces(best.x[0]) * blocks.present[:, None]

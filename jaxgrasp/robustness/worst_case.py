@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import fold, literal
-from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, Compliance, pseudo_inverse, pseudo_inverse_adjoint
+from jaxgrasp.arrays import fold, literal, safe_divide
+from jaxgrasp.contact.compliance import Basis, Compliance, pseudo_inverse, pseudo_inverse_adjoint
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
@@ -165,15 +165,14 @@ def reach_adjoint(
     return columns, friction, half, None
 
 
-def reaches_outside(grasps: Grasps, basis: Basis) -> jax.Array:
-    """Whether the disturbance set has wrenches outside the range of G, (*lanes).
+def reach_outside(grasps: Grasps, basis: Basis) -> jax.Array:
+    """How far the disturbance set reaches outside the range of G, as a share of its size, (*lanes).
 
     Args:
         grasps: the grasps and the set.
         basis: of the rows of G.
     """
     lanes, length = grasps.length.shape, grasps.length
-    tolerance = 10 * RANK_TOLERANCE[length.dtype.name]
 
     def measure() -> jax.Array:
         size = sum(fold(jnp.maximum, extent * grasps.units) for extent in grasps.extents)
@@ -182,6 +181,6 @@ def reaches_outside(grasps: Grasps, basis: Basis) -> jax.Array:
         # The set itself: what smoothing adds would be outside, too, even for directions that are zero.
         terms = tuple(replace(term, width=None) for term in grasps.terms)
         reach = support(terms, jnp.concatenate([outside, -outside], 1))
-        return fold(jnp.maximum, reach) > tolerance * size
+        return safe_divide(fold(jnp.maximum, reach), jnp.broadcast_to(size, lanes))
 
-    return lax.cond(jnp.all(basis.kept > 0), lambda: jnp.zeros(lanes, bool), measure)
+    return lax.cond(jnp.all(basis.kept > 0), lambda: jnp.zeros(lanes, length.dtype), measure)

@@ -31,9 +31,11 @@ class EffortProblem(BlockProblem):
     H is scaled so that its entries are 1 at most. Without lambda the blocks' bounds are |x|_inf <= 1.
 
     guess: where to start, meeting E x = b about, well inside the rows if possible.
+    curvature: like x, c >= 0 with H - diag(c) positive semidefinite, see `least_curvature`.
     """
 
     guess: Rows = ()
+    curvature: Rows = ()
     bordered = False
 
     def start(self) -> Iterate:
@@ -91,6 +93,9 @@ class EffortProblem(BlockProblem):
 
         What a point misses the rows by is charged at the rows' multipliers, twice: what it saves, and as much again, so
         that the effort itself, too, is within the bounds' distance of the least.
+
+        With r = H x + A'z + E'y no u that meets the rows has an effort below -1/2 x'H x - h'z - b'y + r'u +
+        1/2 (u - x)'H (u - x), whose last two terms `_lost` bounds from below.
         """
         x = fenced(self.project)(iterate.x)
 
@@ -104,8 +109,8 @@ class EffortProblem(BlockProblem):
         near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
         upper = jnp.where(missed <= near, value(x) + 2 * charge, jnp.inf)
         held = fold(jnp.add, [total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
-        lost = fold(jnp.add, [total(jnp.abs(d)) for d in residuals.dual])
-        lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - lost
+        lost = map(_lost, self.curvature, iterate.x, residuals.dual)
+        lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - fold(jnp.add, map(total, lost))
         falls, rises = upper < record.upper, lower > record.lower
         return Record(
             lower=jnp.where(rises, lower, record.lower),
@@ -114,3 +119,24 @@ class EffortProblem(BlockProblem):
             y=jnp.where(rises, iterate.y, record.y),
             z=tuple(jnp.where(rises, n, o) for n, o in zip(iterate.z, record.z, strict=True)),
         )
+
+
+def least_curvature(root: jax.Array) -> jax.Array:
+    """Some c >= 0, (k, n, *lanes), with H - diag(c) diagonally dominant: for a diagonal H its diagonal.
+
+    Args:
+        root: (k, k, n, *lanes), H = root' root.
+    """
+    matrix = jnp.stack([fold(jnp.add, root * column[:, None]) for column in jnp.moveaxis(root, 1, 0)])
+    rest = lambda a, row: [jnp.abs(entry) for b, entry in enumerate(row) if b != a]  # noqa: E731
+    return jnp.maximum(jnp.stack([row[a] - sum(rest(a, row)) for a, row in enumerate(matrix)]), 0)
+
+
+def _lost(curvature: jax.Array, x: jax.Array, r: jax.Array) -> jax.Array:
+    """The most that -r u - c/2 (u - x)^2 can be, for every unknown |u| <= 1: of two bounds the better one.
+
+    Where the objective is curved, u is near x, and the sign of r x counts: in float32 this bound is far tighter.
+    """
+    curved = curvature > 0
+    near = 0.5 * r * r / jnp.where(curved, curvature, 1) - r * x
+    return jnp.where(curved, jnp.minimum(near, jnp.abs(r)), jnp.abs(r))

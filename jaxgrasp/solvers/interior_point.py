@@ -34,6 +34,8 @@ class Settings(NamedTuple):
     safeguard: keep s >= safeguard * mu / z and z >= safeguard * mu / s after a step (static; 0.0 switches it off).
     patience: steps in a row that may fail to cut the gap by a tenth.
     gap_floor: gaps up to this one count as closed, whatever their scale; the loop then ends near a central point.
+    gap_share: no step aims at less than this share of the wanted gap (static): nearer to the boundary rounding spoils
+        the Newton system, and with it the stationarity that the bounds need.
     """
 
     tolerance: float
@@ -44,6 +46,7 @@ class Settings(NamedTuple):
     safeguard: float
     patience: int = 3
     gap_floor: float | jax.Array = 0.0
+    gap_share: float = 0.0
 
 
 class Iterate(NamedTuple):
@@ -154,7 +157,13 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         return (carry.step < settings.max_iterations) & jnp.any(carry.active)
 
     def body(carry: _Carry) -> _Carry:
-        stepped, mu = _predict_correct(problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count)
+        least = settings.mu_floor
+        if settings.gap_share:
+            wanted = settings.gap_share * settings.tolerance * problem.gap_scale(carry.record)
+            least = jnp.maximum(least, wanted * inverse_count)
+        stepped, mu = _predict_correct(
+            problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count, least
+        )
         active = carry.active
         take = active & jnp.isfinite(mu)
         iterate = _where(take, stepped, carry.iterate)
@@ -199,6 +208,7 @@ def _predict_correct(
     residuals: Residuals,
     mu: jax.Array,
     inverse_count: jax.Array,
+    least: float | jax.Array,
 ) -> tuple[Iterate, jax.Array]:
     """One step; returns the new iterate and its complementarity, NaN where the step is unusable."""
     lanes, present = len(problem.lanes), problem.present
@@ -246,7 +256,7 @@ def _predict_correct(
         along = inverse_count * _product(iterate.z, ds, lanes)
         across = inverse_count * _product(ds, dz, lanes)
         ratio = ((1 - dual) * mu + (primal - dual) * along + primal * dual * across) / mu
-        aim = jnp.maximum(ratio * ratio * ratio * mu, settings.mu_floor)
+        aim = jnp.maximum(ratio * ratio * ratio * mu, least)
         return jax.tree.map(
             lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, ds, dz, inverse_s, present
         )

@@ -19,6 +19,10 @@ _EQUILIBRATIONS = 10
 _MAX_ITERATIONS = 60
 # Steps without progress at the start, while tau finds its size, are common.
 _PATIENCE = 8
+# A side is far away that is larger than this, in units of the others.
+_FAR = 1e3
+# Sides at least this large are no sides, as in other solvers and in their files.
+_INFINITE = 1e20
 
 
 @jax.tree_util.register_dataclass
@@ -32,11 +36,12 @@ class QPSolution:
     x: jax.Array
     """(*batch, n): the minimiser; if UNBOUNDED a ray with q'x = -1, Px = 0, Ax = 0 and Gx <= 0."""
     s: jax.Array
-    """(*batch, m): slacks h - Gx >= 0; if UNBOUNDED those of the ray, -Gx."""
+    """(*batch, m): slacks h - Gx >= 0, inf where h is infinite; if UNBOUNDED those of the ray, -Gx."""
     y: jax.Array
     """(*batch, p): multipliers of Ax = b; if INFEASIBLE part of a certificate (y, z): A'y + G'z = 0, b'y + h'z = -1."""
     z: jax.Array
-    """(*batch, m): multipliers of Gx <= h, z >= 0; if INFEASIBLE part of that certificate."""
+    """(*batch, m): multipliers of Gx <= h, z >= 0, 0 where h is infinite; if INFEASIBLE part of that certificate, which
+    is NaN where a side is -inf."""
     objective: jax.Array
     """(*batch,): 1/2 x'Px + q'x; inf if INFEASIBLE, -inf if UNBOUNDED."""
     status: jax.Array
@@ -75,7 +80,12 @@ def _equilibrated(program: Program) -> tuple[Program, Iterate]:
 
     scale = lax.fori_loop(0, _EQUILIBRATIONS, equilibrate, jnp.ones(n + p + m, P.dtype))
     d, e, f = scale[:n], scale[n : n + p], scale[n + p :]
-    cost, size = 1 / _typical(q * d), 1 / _typical(jnp.concatenate([b * e, h * f]))
+    # A side that is far away, like 1e12 for none, says nothing about the size of x, and residuals are measured by the
+    # sides: its row is divided until it is no longer far.
+    sides = jnp.concatenate([b * e, h * f])
+    usual = _typical(jnp.where(jnp.abs(sides) <= _FAR * _typical(sides), sides, 0))
+    f = f / jnp.maximum(1, h * f / (_FAR * usual))
+    cost, size = 1 / _typical(q * d), 1 / usual
     P, q, A, b, G, h = program
     scaled = Program(
         P * d * d[:, None] * (cost / size),
@@ -90,6 +100,8 @@ def _equilibrated(program: Program) -> tuple[Program, Iterate]:
 
 def _solve_one(program: Program) -> QPSolution:
     constants = CONSTANTS[program.q.dtype.name]
+    absent, impossible = program.h >= _INFINITE, jnp.any(program.h <= -_INFINITE)
+    program = _without(program, jnp.abs(program.h) >= _INFINITE)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in program]))
     P = (program.P + program.P.T) / 2
     # Rounding in the caller's P may leave it that far from positive semidefinite.
@@ -101,17 +113,33 @@ def _solve_one(program: Program) -> QPSolution:
     settings = Settings(
         constants.tolerance, _MAX_ITERATIONS, constants.step_cap, constants.mu_floor, True, 0.0, _PATIENCE
     )
-    outcome = interior_point.solve(Embedding(lax.stop_gradient(scaled), constants), settings, valid)
+    outcome = interior_point.solve(Embedding(lax.stop_gradient(scaled), constants), settings, valid & ~impossible)
     record, iterate = outcome.record, outcome.record.iterate
     found = jnp.where(record.error <= constants.accept, record.shows, int(Status.MAX_ITERATIONS))
-    status = jnp.where(valid, found, int(Status.INVALID_INPUT))
-    tau, iterate = iterate.z[-1], iterate._replace(s=iterate.s[:-1], z=iterate.z[:-1])
+    status = jnp.where(valid, jnp.where(impossible, int(Status.INFEASIBLE), found), int(Status.INVALID_INPUT))
+    tau, iterate = iterate.z[-1], iterate._replace(s=iterate.s[:-1], z=jnp.where(absent, 0, iterate.z[:-1]))
     at = lambda iterate: Iterate(*map(jnp.multiply, iterate, back))  # noqa: E731
     answer = _answer(lax.stop_gradient(program), at(iterate), tau, status, outcome.iterations)
     solved = status == Status.SOLVED
     point = at(solution_of(scaled, Iterate(*(v / tau for v in iterate)), solved))
     fields = {name: jnp.where(solved, v, getattr(answer, name)) for name, v in point._asdict().items()}
-    return replace(answer, objective=value_at(program, point, answer.objective, solved), **fields)
+    objective = value_at(program, point, answer.objective, solved)
+    told = replace(answer, objective=objective, **fields)
+    hide = lambda v: jnp.where(impossible, jnp.nan, v)  # noqa: E731
+    return replace(
+        told,
+        s=jnp.where(absent & ~jnp.isnan(told.s), jnp.inf, told.s),
+        y=hide(told.y),
+        z=hide(jnp.where(absent & ~jnp.isnan(told.z), 0, told.z)),
+        dual_residual=jnp.where(impossible, jnp.inf, told.dual_residual),
+    )
+
+
+def _without(program: Program, absent: jax.Array) -> Program:
+    """The program with rows 0 x <= 1 in the place of some, the 1 as large as the other sides are."""
+    G, h = jnp.where(absent[:, None], 0, program.G), jnp.where(absent, 0, program.h)
+    size = _typical(lax.stop_gradient(jnp.concatenate([program.b, h])))
+    return program._replace(G=G, h=jnp.where(absent, size, h))
 
 
 def _answer(program: Program, iterate: Iterate, tau: jax.Array, status: jax.Array, iterations: jax.Array) -> QPSolution:
@@ -155,6 +183,9 @@ def solve_qp(
     Minimises 1/2 x'Px + q'x over A x = b and G x <= h. Rows may be dependent, duplicated or zero (rows 0 x = 0 and
     0 x <= 1 pad ragged batches). A step costs O((m + n) n^2).
 
+    Sides of h may be infinite, and 1e20 counts as infinite, like everything beyond: a row with +inf is no row, one with
+    -inf cannot be met. So l <= G x <= u with any sides infinite is G = [G; -G] and h = [u; -l].
+
     Differentiable in all data, forward and reverse and repeatedly, at the cost of about one more step: x, s, y, z and
     objective by the implicit function theorem, see `qp_sensitivity`. Those of objective hold wherever there is a
     solution. Those of the others need it to be unique and strictly complementary: where it is not, they are finite, and
@@ -167,7 +198,7 @@ def solve_qp(
         A: (*batch, p, n), or None with b.
         b: (*batch, p).
         G: (*batch, m, n), or None with h.
-        h: (*batch, m), finite.
+        h: (*batch, m); may be infinite.
 
     Returns:
         A `QPSolution`. The leading axes of all arguments broadcast.
@@ -178,7 +209,7 @@ def solve_qp(
     Status:
         SOLVED where every residual is below 1e-7 (float32: 5e-5) of 1 plus its own terms, in equilibrated units;
         INFEASIBLE and UNBOUNDED with a certificate as exact as that; MAX_ITERATIONS with the best point otherwise;
-        INVALID_INPUT for data that are not finite, or P that is not positive semidefinite.
+        INVALID_INPUT for data that are NaN or, but for h, infinite, or P that is not positive semidefinite.
     """
     q = as_float("q", q, ("n",))
     n = q.shape[-1]

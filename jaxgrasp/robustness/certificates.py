@@ -1,0 +1,81 @@
+"""What the solver's best points are worth in the equality rows as they came, before these were made orthonormal.
+
+The solver works with E = T N, orthonormal combinations of the rows N of G (and of J'f - B u). In floating point E is
+off T N by about eps over what was left of the shortest row, which the solver cannot see. So in the end points are moved
+onto N x = b itself, and with w = T'y the upper bound is taken anew,
+
+    lambda* <= [h'z + b'w + radius |A'z + N'w|_1 + e] / sigma'z,
+
+with what rounding can have done to it: e is eps times the same sums over absolute values, twice what every term may
+have lost; signs being random, longer sums lose no more. sigma is off by about eps over what was left of the shortest
+row of G, as the pseudo-inverse is, and lambda* with it.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxgrasp.arrays import fold, safe_norm
+from jaxgrasp.fence import fenced
+from jaxgrasp.robustness.program import Program
+from jaxgrasp.solvers.block_kkt import BlockProblem, Record, Rows, adjoint_rows, total
+
+# The largest share of the larger of |b| and sum |f_i| that G f may miss b by.
+_EXACT = {"float64": 3e-8, "float32": 1e-5}
+
+
+class Forces(NamedTuple):
+    """Unknowns that meet the equality rows as they came.
+
+    x: the point.
+    exact: bool (*lanes), G f misses b by no more than rounding.
+    """
+
+    x: Rows
+    exact: jax.Array
+
+
+def balanced(program: Program, problem: BlockProblem, x: Rows) -> Forces:
+    """The nearest point on N x = b."""
+    given = program.given
+
+    @fenced
+    def lacking(x: Rows) -> jax.Array:
+        return given.wrench - given.equality(x)
+
+    @fenced
+    def move(x: Rows, gap: jax.Array) -> Rows:
+        back = problem.pull_back(program.basis.coordinates(gap) * program.basis.kept)
+        return tuple(x_g + c for x_g, c in zip(x, back, strict=True))
+
+    x = move(x, lacking(x))
+    missed, load = (safe_norm(v[:6], 0) for v in (lacking(x), given.wrench))
+    applied = fold(jnp.add, safe_norm(program.forces(x[0]), 1) * program.present) / program.mean
+    return Forces(x, missed <= _EXACT[missed.dtype.name] * jnp.maximum(load, applied))
+
+
+def certified(program: Program, problem: BlockProblem, record: Record) -> jax.Array:
+    """The upper bound that the record's multipliers prove, rounding included, (*lanes)."""
+    given, eps = program.given, jnp.finfo(record.upper.dtype).eps
+    w = program.row_multipliers(record.y)
+
+    @fenced
+    def sums(z: Rows, w: jax.Array) -> tuple:
+        value, pull, lost, sizes, felt = [fold(jnp.add, given.wrench * w)], [], [], [], []
+        sizes.append(fold(jnp.add, jnp.abs(given.wrench * w)))
+        for group, z_g, column in zip(problem.groups, z, given.columns, strict=True):
+            products = column * w[:, None, None]
+            value.append(total(group.h * z_g))
+            sizes.append(total(jnp.abs(group.h * z_g)))
+            pull.append(total(group.sigma * z_g))
+            lost.append(total(jnp.abs(adjoint_rows(group, z_g) + fold(jnp.add, products))))
+            # No entry of A is larger than 1.
+            felt.append(total(fold(jnp.add, jnp.abs(products)) + fold(jnp.add, z_g)))
+        return tuple(fold(jnp.add, parts) for parts in (value, pull, lost, sizes, felt))
+
+    value, pull, lost, sizes, felt = sums(record.z, w)
+    radius = 1 + problem.radius * jnp.where(jnp.isinf(record.lower), 0, jnp.maximum(0, -record.lower))
+    upper = value + radius * (lost + eps * felt) + eps * sizes
+    upper = jnp.where(pull > 0, upper / jnp.where(pull > 0, pull, 1), jnp.inf)
+    return upper + 2 * eps / program.least_ratio * jnp.abs(upper)
