@@ -7,7 +7,7 @@ from jaxgrasp.candidates.candidates import Candidates
 
 # Of each source at most so many grasps are looked at.
 _LOOKED_AT = 10_000
-# A grasp's contacts are this far from their middle, m, where nothing else is known: half the breadth of what a hand holds.
+# Where nothing else is known, a grasp's contacts are this far from their middle, m: half the breadth of what one holds.
 _USUAL_SIZE = 0.05
 _LARGEST_SIZE, _SMALLEST_SIZE = 1.0, 1e-3
 _UNITS = {1e-2: "centimetres", 1e-3: "millimetres", 1e-6: "micrometres"}

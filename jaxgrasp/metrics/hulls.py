@@ -83,8 +83,8 @@ def _sums(groups: list[np.ndarray]) -> np.ndarray:
         fitting = math.floor(_MOST_POINTS ** (1 / len(groups)) + 1e-9) - 1
         fewer = f"cone_edges={fitting} (--cone-edges {fitting}), or " if fitting >= 3 else ""
         raise ValueError(
-            f"cone_edges: got {len(groups)} contacts with {len(groups[0])} edges each, {count:,} points of the Linf wrench "
-            f"space; wanted at most {_MOST_POINTS:,}: {fewer}ferrari_canny_bound with the norm Linf "
+            f"cone_edges: got {len(groups)} contacts with {len(groups[0])} edges each, {count:,} points of the Linf "
+            f"wrench space; wanted at most {_MOST_POINTS:,}: {fewer}ferrari_canny_bound with the norm Linf "
             "(--metric ferrari_canny_linf_bound), which takes any number"
         )
     choices = itertools.product(*[_flat([group]) for group in groups])

@@ -1,9 +1,9 @@
 """Whether the origin is strictly inside the hull of wrenches: force closure, by one damped Newton method.
 
 The origin is inside the hull of the w_k, and they span the space, exactly where the polar {u : w_k'u <= 1} is bounded,
-and so exactly where its barrier f(u) = -sum log(1 - w_k'u) has a minimum. f is self-concordant: damped Newton steps fall
-towards a minimum where there is one, and a Newton decrement below 1 proves that there is. Where there is none, u goes
-to infinity along a direction that no wrench opposes.
+and so exactly where its barrier f(u) = -sum log(1 - w_k'u) has a minimum. f is self-concordant: damped Newton steps
+fall towards a minimum where there is one, and a Newton decrement below 1 proves that there is (Nesterov and
+Nemirovskii, 1994). Where there is none, u goes to infinity along a direction that no wrench opposes.
 """
 
 import jax

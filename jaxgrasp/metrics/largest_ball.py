@@ -27,8 +27,8 @@ Norm = Literal["L1", "Linf"]
 # nearest slack.
 _RANDOM_STARTS, _STEPS, _LAST_STEPS = 12, 11, 11
 _STRIDE = 0.9
-# The polar of a grasp without force closure has no bound, and that of others is no longer than this, in units of one over
-# the longest wrench: n is kept in a box of this size.
+# The polar of a grasp without force closure has no bound, and that of others is no longer than this, in units of one
+# over the longest wrench: n is kept in a box of this size.
 _REACH = {name: 1 / radius for name, radius in SMALLEST_BALL.items()}
 
 

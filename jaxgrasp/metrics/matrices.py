@@ -22,8 +22,8 @@ def smallest_singular_value(contacts: Contacts, space: WrenchSpace | None = None
         space: conventions, of which the edges do not matter; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), exactly 0 where the map has not full rank; NaN for data that are not admissible. Differentiable; where
-        several singular values are equal, by one of them.
+        (*batch,), exactly 0 where the map has not full rank; NaN for data that are not admissible. Differentiable;
+        where several singular values are equal, by one of them.
 
     Raises:
         ValueError: options or shapes that do not fit.
@@ -43,7 +43,8 @@ def isotropy(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Arra
         space: conventions, of which the edges do not matter; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), between 0 and 1, exactly 0 where the map has not full rank; NaN for data that are not admissible. Differentiable.
+        (*batch,), between 0 and 1, exactly 0 where the map has not full rank; NaN for data that are not admissible.
+        Differentiable.
 
     Raises:
         ValueError: options or shapes that do not fit.

@@ -32,8 +32,8 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
         space: conventions; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), exactly 0 where some wrench cannot be exerted, inf without any; NaN for data that are not admissible or a
-        program that could not be solved. Differentiable.
+        (*batch,), exactly 0 where some wrench cannot be exerted, inf without any; NaN for data that are not admissible
+        or a program that could not be solved. Differentiable.
 
     Raises:
         ValueError: a set that is not given by vertices, options or shapes that do not fit.

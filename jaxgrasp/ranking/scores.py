@@ -62,7 +62,7 @@ def score(
         own = name == "margin"
         settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None if own else _TILE, "spread": own}
         for rows, value in solve_in_tiles(_scorer(name, cone_edges), columns, disturbances, **settings):
-            values[rows] = value
+            values[rows] = value + 0.0  # minus zero is zero
             report(rows.stop)
         return values
     setting = Setting(disturbances=disturbances, cone_edges=cone_edges, task={})
