@@ -9,8 +9,9 @@ from jaxgrasp.contact import Contacts
 from jaxgrasp.metrics.largest_ball import Norm, check_norm
 from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, one_hull, only_one
 
-# Points of which Qhull makes a hull in six dimensions within some minutes.
-_MOST_POINTS = 2_000
+# Points of a Linf wrench space of which Qhull makes a hull within some ten seconds and a gigabyte: 6,561, of four
+# contacts with eight edges, took 9 s and 0.6 GB.
+_MOST_POINTS = 10_000
 # A smaller ball, in units of the longest wrench, is Qhull's rounding of a facet through the origin.
 _SMALLEST_BALL = 1e-10
 

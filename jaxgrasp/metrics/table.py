@@ -105,7 +105,7 @@ METRICS = {
         ),
         Metric(
             name="ferrari_canny_linf",
-            about="the same, each normal force 1 (hull: slow, few edges)",
+            about="the same, each normal force 1 (hull: seconds a grasp, few edges)",
             value=lambda c, s: ferrari_canny(c, "Linf", s.space),
             batched=False,
         ),
