@@ -64,7 +64,9 @@ def _doubts_of_positions(candidates: Candidates) -> list[str]:
             f"grasps are {distance:.3g} m from the origin, and their contacts {usual:.3g} m from each other's middle"
         )
         center = candidates.columns.get("center_of_mass")
-        if center is not None and np.nanmedian(np.linalg.norm(middle - center, axis=-1)) < distance / 3:
+        # Files without the column have NaN there.
+        off = np.empty(0) if center is None else np.linalg.norm(middle - center, axis=-1)
+        if np.isfinite(off).any() and np.nanmedian(off) < distance / 3:
             return [f"{found}; wanted positions about the centre of mass: subtract the column center_of_mass"]
         if distance > _LARGEST_SIZE:
             return [f"{found}; wanted positions about the centre of mass"]

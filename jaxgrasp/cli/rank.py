@@ -187,8 +187,12 @@ class Rank:
         from jaxgrasp.ranking import is_zero, why_zero
         from jaxgrasp.ranking.tiles import columns_of, contacts_of
 
-        contacts = contacts_of(columns_of(ranking.candidates))
-        return why_zero(contacts, is_zero(ranking.margin, ranking.status), disturbances, cone_edges=self.cone_edges)
+        return why_zero(
+            lambda rows: contacts_of(columns_of(ranking.candidates.take(rows))),
+            is_zero(ranking.margin, ranking.status),
+            disturbances,
+            cone_edges=self.cone_edges,
+        )
 
     def _write(self, ranking: "Ranking", unit: str, hand: "HandObject | None") -> tuple[list[Path], bool]:
         from jaxgrasp.ranking import write_table

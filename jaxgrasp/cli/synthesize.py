@@ -194,13 +194,13 @@ class Synthesize:
         from jaxgrasp.contact import Contacts
         from jaxgrasp.ranking import is_zero, why_zero
 
-        contacts = Contacts.from_normals(
-            found.positions,
-            found.outward_normals,
-            friction=self.friction or _FRICTION,
-            max_force=self.max_force,
+        given = {"friction": self.friction or _FRICTION, "max_force": self.max_force}
+        return why_zero(
+            lambda rows: Contacts.from_normals(found.positions[rows], found.outward_normals[rows], **given),
+            is_zero(found.margin, found.status),
+            disturbances,
+            cone_edges=self.cone_edges,
         )
-        return why_zero(contacts, is_zero(found.margin, found.status), disturbances, cone_edges=self.cone_edges)
 
     def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], bool]:
         import jax

@@ -1,5 +1,7 @@
 """Why margins are zero: what the contacts of a grasp lack, in words."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,13 +41,18 @@ def is_zero(margin: Float[np.ndarray, " batch"], status: Int[np.ndarray, " batch
 
 
 def why_zero(
-    contacts: Contacts, zero: Bool[np.ndarray, " batch"], disturbances: DisturbanceSet, *, cone_edges: int = 8
+    contacts_of: Callable[[Int[np.ndarray, " rows"]], Contacts],
+    zero: Bool[np.ndarray, " batch"],
+    disturbances: DisturbanceSet,
+    *,
+    cone_edges: int = 8,
 ) -> list[str]:
     """Find out why the margins (21) of grasps are zero.
 
     Args:
-        contacts: The grasps, with one batch axis.
-        zero: Which of them have a margin of zero.
+        contacts_of: Makes the contacts of some grasps by their numbers, with one batch axis: there may be too many for
+            all at once.
+        zero: Which grasps have a margin of zero.
         disturbances: The set that the margins scale, the same for all.
         cone_edges: Edges of the friction pyramid.
 
@@ -57,7 +64,7 @@ def why_zero(
     if not len(rows):
         return []
     looked_at = rows[:: -(-len(rows) // _LOOKED_AT)]
-    found = _reasons(jax.tree.map(lambda leaf: leaf[looked_at], contacts), disturbances, cone_edges)
+    found = _reasons(contacts_of(looked_at), disturbances, cone_edges)
     of = "" if len(looked_at) == len(rows) else f" of {len(looked_at):,} looked at"
     counts = {reason: int((found == number).sum()) for number, reason in enumerate(_REASONS)}
     return [
