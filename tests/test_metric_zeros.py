@@ -106,6 +106,7 @@ def test_balls_without_closure_are_zero():
         assert radius > 1e-6 if closed[row] else radius == 0
 
 
+@pytest.mark.thorough
 def test_gradients_without_closure_are_zero():
     contacts = contacts_of(np.float64)
     total = lambda p: bound(jg.Contacts(**{**vars(contacts), "positions": p}), "L1", SPACE).sum()  # noqa: E731
