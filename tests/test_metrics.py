@@ -106,7 +106,7 @@ def test_a_bound_is_never_below_and_mostly_the_ball_itself():
     assert np.all(above >= radii * (1 - FACET_TOLERANCE))
     closed = radii > 0
     assert np.mean(above[closed] <= radii[closed] * (1 + FACET_TOLERANCE)) >= 0.9
-    assert np.all(above[~closed] < 1e-5)
+    assert np.all(above[~closed] == 0)
 
 
 @pytest.mark.thorough
@@ -120,7 +120,7 @@ def test_a_bound_where_each_force_is_bounded():
         exact = metrics.ferrari_canny(one(contacts, row), "Linf", SPACE)
         np.testing.assert_allclose(exact, ball(sums), atol=1e-12)
         assert above[row] >= exact * (1 - FACET_TOLERANCE)
-        assert above[row] <= exact * (1 + 1e-6) + 1e-5
+        assert above[row] <= exact * (1 + 1e-6)
 
 
 def test_min_weights_are_those_of_highs():
@@ -263,12 +263,13 @@ def test_few_contacts_get_answers():
     contacts = jg.Contacts.from_normals(positions, normals, friction=0.5, max_force=1.0, active=active)
     found = jax.tree.map(lambda x: np.asarray(x)[:2], closure(contacts, SPACE))
     assert not found.closed.any() and np.all(found.status == jg.Status.SOLVED)
-    # Two opposite contacts cancel, but leave the rotation about their line.
-    np.testing.assert_array_equal(found.min_weight > 0, [False, True])
+    # Two opposite contacts cancel, but leave the rotation about their line: no closure.
+    assert found.min_weight[0] < 0 and found.min_weight[1] == 0
     raw = metrics.edge_wrenches(contacts, WrenchSpace(cone_edges=EDGES, length=1.0))[:2]
     twist = found.separating_twist
     assert np.all(np.einsum("bcei,bi->bce", raw, twist) < 1e-9) and np.all(np.abs(twist).max(-1) > 0.1)
-    assert np.all(np.asarray(cheap(contacts, SPACE)[0]) < 1e-9)
+    smallest, isotropy, residual = map(np.asarray, cheap(contacts, SPACE))
+    assert not smallest.any() and not isotropy.any() and residual[0] > 0 and not residual[1:].any()
     for row in range(2):
         assert metrics.ferrari_canny(one(contacts, row), "L1", SPACE) == 0
         assert metrics.wrench_space_volume(one(contacts, row), SPACE) == 0
@@ -351,8 +352,8 @@ def test_what_cannot_be_asked_is_refused():
         metrics.ferrari_canny(contacts)
     with pytest.raises(ValueError, match="wanted 'L1' or 'Linf'"):
         metrics.ferrari_canny(one(contacts, 0), "L2")
-    with pytest.raises(ValueError, match="fewer edges"):
-        metrics.ferrari_canny(one(contacts, 0), "Linf")
+    with pytest.raises(ValueError, match="cone_edges=9 "):
+        metrics.ferrari_canny(one(contacts, 0), "Linf", WrenchSpace(cone_edges=16))
     with pytest.raises(ValueError, match="at least 3"):
         metrics.min_weight(contacts, WrenchSpace(cone_edges=2))
     with pytest.raises(ValueError, match="without vertices"):

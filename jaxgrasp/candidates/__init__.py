@@ -2,6 +2,7 @@
 
 from jaxgrasp.candidates.archive import CandidateError, read_archive, read_array
 from jaxgrasp.candidates.candidates import Candidates, concatenate
+from jaxgrasp.candidates.plausibility import doubtful_conventions
 from jaxgrasp.candidates.reader import read_candidates
 from jaxgrasp.candidates.superquadric import Superquadric, sample_grasps
 from jaxgrasp.candidates.wrenches import read_wrenches
@@ -11,6 +12,7 @@ __all__ = [
     "Candidates",
     "Superquadric",
     "concatenate",
+    "doubtful_conventions",
     "read_archive",
     "read_array",
     "read_candidates",

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli.metrics import metric_names, scores_of
-from jaxgrasp.cli.problems import CommandError, check_output, write_files
+from jaxgrasp.cli.problems import CommandError, check_output, warn_of_conventions, write_files
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
 if TYPE_CHECKING:
@@ -110,6 +110,7 @@ class Compare:
             )
         except CandidateError as error:
             raise CommandError(str(error)) from error
+        warn_of_conventions(candidates)
         outcome, success = self._success(candidates)
         stored = {name: self._column(candidates, name, "--columns", "biuf").astype(float) for name in self.columns}
         within = self._column(candidates, self.within, "--within", "biufU") if self.within else None

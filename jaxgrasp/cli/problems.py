@@ -4,6 +4,10 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxgrasp.candidates import Candidates
 
 
 class CommandError(Exception):
@@ -51,6 +55,19 @@ def check_output(path: Path, option: str, endings: Sequence[str], inputs: Sequen
             os.unlink(path)
     except OSError as error:
         raise CommandError(f"{option} {path}: cannot be written ({(error.strerror or str(error)).lower()})") from error
+
+
+def warn_of_conventions(candidates: "Candidates") -> None:
+    """Tells on standard error, in one line, of units and directions of contacts that can hardly be meant.
+
+    Args:
+        candidates: Grasps by their contacts.
+    """
+    from jaxgrasp.candidates import doubtful_conventions
+
+    doubts = doubtful_conventions(candidates)
+    if doubts:
+        print(f"jaxgrasp: warning: {' | '.join(doubts)}", file=sys.stderr)
 
 
 def write_files(*jobs: tuple[Path | None, Callable[[Path], None]]) -> tuple[list[Path], bool]:

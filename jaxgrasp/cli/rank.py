@@ -10,12 +10,13 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli.metrics import metric_names, scores_of
-from jaxgrasp.cli.problems import CommandError, check_options, check_output, write_files
+from jaxgrasp.cli.problems import CommandError, check_options, check_output, warn_of_conventions, write_files
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
+    from jaxgrasp.cli.report import Clock
     from jaxgrasp.disturbance import DisturbanceSet
     from jaxgrasp.hands import HandObject
     from jaxgrasp.ranking import Ranking
@@ -89,15 +90,21 @@ class Rank:
         self._check()
         configure_jax()
         from jaxgrasp.candidates import CandidateError
+        from jaxgrasp.cli.report import Clock
 
+        clock = Clock()
         hand = self.of_hand.hand(self.friction, self.max_force) if self.of_hand.scene else None
         try:
             disturbances, unit = named_disturbances(self.disturbances)
             candidates = self._candidates() if hand is None else self.of_hand.candidates(hand)
         except CandidateError as error:
             raise CommandError(str(error)) from error
+        if hand is None:
+            warn_of_conventions(candidates)
+        clock.lap()
         metrics = scores_of(candidates, names, disturbances, gravity=self.gravity, cone_edges=self.cone_edges)
-        return self._rank(candidates, disturbances, unit, hand, metrics)
+        clock.lap("metrics" if metrics else "")
+        return self._rank(candidates, disturbances, unit, hand, metrics, clock)
 
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
@@ -145,11 +152,11 @@ class Rank:
         unit: str,
         hand: "HandObject | None",
         metrics: dict[str, np.ndarray],
+        clock: "Clock",
     ) -> int:
-        from jaxgrasp.cli.report import Clock, print_ranking, progress_bar
+        from jaxgrasp.cli.report import print_ranking, progress_bar
         from jaxgrasp.ranking import RankingInterrupted, rank
 
-        clock = Clock()
         exit_code = 0
         try:
             with progress_bar(len(candidates), clock) as progress:
@@ -171,9 +178,21 @@ class Rank:
             print(f"jaxgrasp: {what}: ranked {len(ranking.margin):,} of {len(candidates):,}", file=sys.stderr)
             if len(ranking.margin) == 0:
                 return exit_code
+        clock.lap()
         written, failed = self._write(ranking, unit, hand)
-        print_ranking(ranking, unit, clock, written)
+        print_ranking(ranking, unit, clock, self._why_zero(ranking, disturbances), written)
         return exit_code or (2 if failed else 0)
+
+    def _why_zero(self, ranking: "Ranking", disturbances: "DisturbanceSet") -> list[str]:
+        from jaxgrasp.ranking import is_zero, why_zero
+        from jaxgrasp.ranking.tiles import columns_of, contacts_of
+
+        return why_zero(
+            lambda rows: contacts_of(columns_of(ranking.candidates.take(rows))),
+            is_zero(ranking.margin, ranking.status),
+            disturbances,
+            cone_edges=self.cone_edges,
+        )
 
     def _write(self, ranking: "Ranking", unit: str, hand: "HandObject | None") -> tuple[list[Path], bool]:
         from jaxgrasp.ranking import write_table

@@ -25,23 +25,32 @@ _PLAIN_WIDTH = 160
 
 
 class Clock:
-    """Keeps apart the first tile, whose time is mostly compilation, from those that follow."""
+    """Times all work on candidates, and apart from it the tiles of margins after the first, which mostly compiles."""
 
     def __init__(self) -> None:
         """Starts."""
-        self.start = time.perf_counter()
+        self.start = self.end = time.perf_counter()
+        self.parts: dict[str, float] = {}
         self.ticks: list[tuple[float, int]] = []
 
     def tick(self, done: int) -> None:
         """Notes that so many candidates are done."""
         self.ticks.append((time.perf_counter(), done))
 
+    def lap(self, what: str = "") -> None:
+        """Ends the time so far; what was done since the last lap is told apart where it has a name."""
+        now = time.perf_counter()
+        if what:
+            self.parts[what] = now - self.end
+        self.end = now
+
     def __str__(self) -> str:
         """Returns how long it took and, where more than one tile was solved, how many a second after the first."""
         (first, before), (last, done) = self.ticks[0], self.ticks[-1]
-        text = f"{done:,} candidates in {last - self.start:.1f} s, compilation included"
+        text = f"{done:,} candidates in {self.end - self.start:.1f} s, compilation included"
+        text += "".join(f", {seconds:.1f} s of them for {what}" for what, seconds in self.parts.items())
         if len(self.ticks) > 1:
-            text += f"; {(done - before) / (last - first):,.0f} a second once compiled"
+            text += f"; margins: {(done - before) / (last - first):,.0f} a second once compiled"
         return text
 
 
@@ -102,7 +111,7 @@ def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
         task = progress.add_task("compiling", total=steps)
 
         def show(done: int, record: "Record") -> None:
-            text = f"margin: median {record.median[-1]:.3g}, best {record.best[-1]:.3g}"
+            text = f"margin: median {record.median[-1]:z.3g}, best {record.best[-1]:z.3g}"
             progress.update(task, completed=done, description=text)
 
         yield show
@@ -158,13 +167,15 @@ def print_hand_synthesis(found: "HandSynthesis", kept: int, name: str, unit: str
     ):
         good = margin[verdict == Verdict.GOOD]
         shares = [f"{(verdict == each).mean():.1%}" for each in verdicts]
-        table.add_row(label, *shares, *([f"{np.median(good):.4g}", f"{good.max():.4g}"] if len(good) else ["", ""]))
+        table.add_row(label, *shares, *([f"{np.median(good):z.4g}", f"{good.max():z.4g}"] if len(good) else ["", ""]))
     console.print(table)
     if written:
         console.print(f"written: {', '.join(map(str, written))} ({kept:,} grasps)", markup=False)
 
 
-def print_synthesis(found: "Synthesis", name: str, note: str, unit: str, written: Sequence[Path]) -> None:
+def print_synthesis(
+    found: "Synthesis", name: str, note: str, unit: str, why_zero: Sequence[str], written: Sequence[Path]
+) -> None:
     """Prints what a synthesis found to standard output.
 
     Args:
@@ -172,6 +183,7 @@ def print_synthesis(found: "Synthesis", name: str, note: str, unit: str, written
         name: The object's name.
         note: What else is to be said of the object; empty for nothing.
         unit: Unit of the margin.
+        why_zero: Why margins are zero, of `ranking.why_zero`.
         written: The files that were written.
     """
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
@@ -183,19 +195,21 @@ def print_synthesis(found: "Synthesis", name: str, note: str, unit: str, written
     for label, margin in (("random starts", found.first_margin), ("synthesised", found.margin)):
         known = np.nan_to_num(margin, nan=0.0)
         low, middle, best = np.quantile(known, (0.1, 0.5, 1.0))
-        table.add_row(label, f"{low:.4g}", f"{middle:.4g}", f"{best:.4g}", f"{(known > 1e-4).mean():.1%}")
+        table.add_row(label, f"{low:z.4g}", f"{middle:z.4g}", f"{best:z.4g}", f"{(known > 1e-4).mean():.1%}")
     console.print(table)
+    _print_zeros(console, "synthesised with a margin of zero", why_zero)
     if written:
         console.print("written: " + ", ".join(map(str, written)), markup=False)
 
 
-def print_ranking(ranking: Ranking, unit: str, clock: Clock, written: Sequence[Path]) -> None:
+def print_ranking(ranking: Ranking, unit: str, clock: Clock, why_zero: Sequence[str], written: Sequence[Path]) -> None:
     """Prints a ranking to standard output.
 
     Args:
         ranking: The ranking.
         unit: Unit of the margin.
         clock: How long it took.
+        why_zero: Why margins are zero, of `ranking.why_zero`.
         written: The files that were written.
     """
     # Without a terminal rich would assume 80 columns and cut names short.
@@ -210,6 +224,10 @@ def print_ranking(ranking: Ranking, unit: str, clock: Clock, written: Sequence[P
     if unanswered:
         console.print(f"no tightening forces for {unanswered} of the best {len(ranking.forces)}")
     console.print(_counts(ranking))
+    _print_zeros(console, "a margin of zero", why_zero)
+    for name, value in list(ranking.metrics.items())[:1]:
+        if len(value) > 1 and (value == value[0]).all():
+            console.print(f"{name}: {value[0]:z.4g} for all, which leaves them in the order of the files", markup=False)
     console.print(str(clock))
     if written:
         console.print("written: " + ", ".join(map(str, written)), markup=False)
@@ -237,13 +255,18 @@ def print_comparison(found: MetricComparison, outcome: str, count: int, written:
         if prediction:
             (low, high), (lead, least, most) = prediction.interval[row], prediction.lead[row]
             cells += [f"{prediction.auc[row]:.3f}", f"{low:.3f} .. {high:.3f}"]
-            cells += [f"{lead:+.3f}", f"{least:+.3f} .. {most:+.3f}"] if row else ["", ""]
-        table.add_row(str(row + 1), escape(name), *cells, *(f"{value:.2f}" for value in found.correlation[row]))
+            cells += [f"{lead:+z.3f}", f"{least:+z.3f} .. {most:+z.3f}"] if row else ["", ""]
+        table.add_row(str(row + 1), escape(name), *cells, *(f"{value:z.2f}" for value in found.correlation[row]))
     console.print(table)
     if not prediction:
         console.print("no column of success: no ROC curves")
     if written:
         console.print("written: " + ", ".join(map(str, written)), markup=False)
+
+
+def _print_zeros(console: Console, what: str, why_zero: Sequence[str]) -> None:
+    if why_zero:
+        console.print(f"{what}: {'; '.join(why_zero)}", markup=False, soft_wrap=True)
 
 
 def _table(ranking: Ranking, rows: int, unit: str) -> Table:
@@ -265,12 +288,12 @@ def _table(ranking: Ranking, rows: int, unit: str) -> Table:
             str(place + 1),
             escape(f"{source}:{candidates.index[row]}"),
             *(escape(str(candidates.columns[name][row])) for name in texts),
-            *(f"{ranking.metrics[name][row]:.4g}" for name in others),
-            f"{ranking.margin[row]:.4g}",
-            f"{ranking.upper_bound[row]:.4g}",
+            *(f"{ranking.metrics[name][row]:z.4g}" for name in others),
+            f"{ranking.margin[row]:z.4g}",
+            f"{ranking.upper_bound[row]:z.4g}",
             Status(int(ranking.status[row])).name,
-            f"{normal:.4g}",
-            f"{ranking.effort[place]:.4g}",
+            f"{normal:z.4g}",
+            f"{ranking.effort[place]:z.4g}",
         )
     return table
 

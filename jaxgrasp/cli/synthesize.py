@@ -105,7 +105,7 @@ class Synthesize:
         from jaxgrasp.cli.report import print_synthesis
 
         written, failed = self._write(found, shape, name, unit)
-        print_synthesis(found, name, note, unit, written)
+        print_synthesis(found, name, note, unit, self._why_zero(found, disturbances), written)
         return 2 if failed else 0
 
     def _check(self) -> None:
@@ -189,6 +189,18 @@ class Synthesize:
                 cone_edges=self.cone_edges,
                 progress=progress,
             )
+
+    def _why_zero(self, found: "Synthesis", disturbances: Any) -> list[str]:
+        from jaxgrasp.contact import Contacts
+        from jaxgrasp.ranking import is_zero, why_zero
+
+        given = {"friction": self.friction or _FRICTION, "max_force": self.max_force}
+        return why_zero(
+            lambda rows: Contacts.from_normals(found.positions[rows], found.outward_normals[rows], **given),
+            is_zero(found.margin, found.status),
+            disturbances,
+            cone_edges=self.cone_edges,
+        )
 
     def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], bool]:
         import jax

@@ -44,23 +44,25 @@ def min_weight(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Ar
 
         max l   over (alpha, l)   such that   sum alpha_k w_k = 0,   sum alpha_k = 1,   alpha_k >= l.
 
-    Positive exactly where the origin is strictly inside the hull of the wrenches, within what they span; at most one
-    over the number of edges. It does not depend on the unit of moments or the reference, but on `unit_edges`. What is
-    solved is the dual, with seven unknowns.
+    Positive exactly where there is force closure, and then at most one over the number of edges. Edges that do not span
+    the space of wrenches may cancel with positive weights, too (those of two opposite contacts do): that is no closure,
+    and the answer is 0. It does not depend on the unit of moments or the reference, but on `unit_edges`. What is solved
+    is the dual, with seven unknowns.
 
     Args:
         contacts: the grasps.
         space: conventions; `WrenchSpace()` where None. FRoGGeR has four edges of unit norm.
 
     Returns:
-        (*batch,), -inf where no weights of any sign that sum up to 1 cancel; NaN for data that are not admissible or a
-        program that could not be solved. Differentiable where finite; elsewhere gradients are zero.
+        (*batch,), exactly 0 on the boundary of closure, negative beyond it, -inf where no weights of any sign that sum
+        up to 1 cancel; NaN for data that are not admissible or a program that could not be solved. Differentiable where
+        finite and not 0; elsewhere gradients are zero.
 
     Raises:
         ValueError: options or shapes that do not fit.
     """
     edges = edges_of(contacts, space)
-    return _weight(edges, _dual(edges))
+    return _above_rounding(edges, _weight(edges, _dual(edges)), _spans(edges, _decomposed(edges)[1]))
 
 
 def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> ForceClosure:
@@ -87,11 +89,8 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     dual = _dual(edges)
     least = _weight(edges, dual)
     dtype = edges.wrenches.dtype
-    left, singular, _ = jnp.linalg.svd(jnp.swapaxes(edges.flat, -1, -2), full_matrices=False)
-    if singular.shape[-1] < 6:
-        spans = jnp.zeros(edges.valid.shape, bool)
-    else:
-        spans = singular[..., 5] > RANK_TOLERANCE[dtype.name] * singular[..., 0]
+    left, singular = _decomposed(edges)
+    spans = _spans(edges, singular)
     positive = least * _count(edges) > _LEAST_WEIGHT[dtype.name]
     known = edges.valid & (dual.status != Status.MAX_ITERATIONS)
     closed = known & spans & positive
@@ -109,7 +108,7 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
         closed=closed,
         internal_forces=jnp.where(closed[..., None, None], forces, jnp.nan),
         separating_twist=jnp.where((known & ~closed)[..., None], turned, jnp.nan),
-        min_weight=least,
+        min_weight=_above_rounding(edges, least, spans),
         status=jnp.where(edges.valid, status, int(Status.INVALID_INPUT)),
     )
 
@@ -131,6 +130,26 @@ def _weight(edges: Edges, dual: QPSolution) -> jax.Array:
     solved = dual.status == Status.SOLVED
     value = jnp.where(solved, dual.objective, 0) / _count(edges)
     return hidden(edges, jnp.where(none, -jnp.inf, jnp.where(solved, value, jnp.nan)))
+
+
+def _decomposed(edges: Edges) -> tuple[jax.Array, jax.Array]:
+    """Left singular vectors and singular values of the wrenches."""
+    # Derivatives do not go through them: whether edges span the space does not change by little.
+    W = jax.lax.stop_gradient(edges.flat)
+    return jnp.linalg.svd(jnp.swapaxes(W, -1, -2), full_matrices=False)[:2]
+
+
+def _spans(edges: Edges, singular: jax.Array) -> jax.Array:
+    """Whether the wrenches span the space."""
+    if singular.shape[-1] < 6:
+        return jnp.zeros(edges.valid.shape, bool)
+    return singular[..., 5] > RANK_TOLERANCE[singular.dtype.name] * singular[..., 0]
+
+
+def _above_rounding(edges: Edges, least: jax.Array, spans: jax.Array) -> jax.Array:
+    """The least weight, and 0 where it is not told from 0 or is positive without closure."""
+    tolerance = _LEAST_WEIGHT[least.dtype.name] / _count(edges)
+    return jnp.where((jnp.abs(least) <= tolerance) | ((least > 0) & ~spans), 0, least)
 
 
 def _count(edges: Edges) -> jax.Array:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.contact import Contacts
+from jaxgrasp.metrics.interior import SMALLEST_BALL, contains_origin
 from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, hidden
 
 Norm = Literal["L1", "Linf"]
@@ -26,9 +27,9 @@ Norm = Literal["L1", "Linf"]
 # nearest slack.
 _RANDOM_STARTS, _STEPS, _LAST_STEPS = 12, 11, 11
 _STRIDE = 0.9
-# The polar of a grasp without force closure has no bound: n is kept in a box of this size, in units of the longest
-# wrench. So the radius is never told to be smaller than one over the box's diagonal.
-_REACH = {"float64": 1e6, "float32": 1e3}
+# The polar of a grasp without force closure has no bound, and that of others is no longer than this, in units of one
+# over the longest wrench: n is kept in a box of this size.
+_REACH = {name: 1 / radius for name, radius in SMALLEST_BALL.items()}
 
 
 def ferrari_canny_bound(
@@ -45,9 +46,9 @@ def ferrari_canny_bound(
         space: conventions; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), like `ferrari_canny`; at most 1e-6 (float32: 1e-3) of the longest wrench where there is no force
-        closure, NaN for data that are not admissible. Differentiable once, by the facet's own multipliers; where two
-        facets are equally near, that of one of them.
+        (*batch,), like `ferrari_canny`; exactly 0 where there is no force closure, or less of it than a ball of 1e-7
+        (float32: 1e-3) of the longest wrench; NaN for data that are not admissible. Differentiable once, by the
+        facet's own multipliers; where two facets are equally near, that of one of them; 0 without closure.
 
     Raises:
         ValueError: options or shapes that do not fit.
@@ -75,12 +76,15 @@ def _radius(wrenches: jax.Array) -> jax.Array:
     longest = jnp.sqrt(jnp.max(jnp.sum(wrenches * wrenches, -1)))
     scale = lax.stop_gradient(jnp.where(longest > 0, longest, 1))
     W = wrenches / scale
+    closed = contains_origin(W.reshape(-1, 6))
     n, weights = lax.stop_gradient(_farthest(lax.stop_gradient(W)))
+    # The last step of a walk along an unbounded polar may have none.
+    weights = jnp.where(jnp.isfinite(weights), weights, 0)
     size = jnp.sqrt(n @ n)
     # Of max 1/2 n'n the derivative is that of the Lagrangian, - weights n'dw; the value stays what it is.
     reach = jnp.sum(weights * (W @ n))
     value = 1 / size + safe_divide(reach - lax.stop_gradient(reach), size**3)
-    return jnp.where(longest > 0, scale * value, 0)
+    return jnp.where(closed, scale * value, 0)
 
 
 def _farthest(W: jax.Array) -> tuple[jax.Array, jax.Array]:

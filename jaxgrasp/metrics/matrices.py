@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import safe_divide, safe_norm
 from jaxgrasp.contact import Contacts
+from jaxgrasp.contact.compliance import RANK_TOLERANCE
 from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, hidden
 
 
@@ -21,8 +22,8 @@ def smallest_singular_value(contacts: Contacts, space: WrenchSpace | None = None
         space: conventions, of which the edges do not matter; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), 0 where the map has not full rank; NaN for data that are not admissible. Differentiable; where
-        several singular values are equal, by one of them.
+        (*batch,), exactly 0 where the map has not full rank; NaN for data that are not admissible. Differentiable;
+        where several singular values are equal, by one of them.
 
     Raises:
         ValueError: options or shapes that do not fit.
@@ -42,7 +43,8 @@ def isotropy(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Arra
         space: conventions, of which the edges do not matter; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), between 0 and 1; NaN for data that are not admissible. Differentiable.
+        (*batch,), between 0 and 1, exactly 0 where the map has not full rank; NaN for data that are not admissible.
+        Differentiable.
 
     Raises:
         ValueError: options or shapes that do not fit.
@@ -69,7 +71,10 @@ def closure_residual(contacts: Contacts, space: WrenchSpace | None = None) -> Fl
         ValueError: options or shapes that do not fit.
     """
     edges = edges_of(contacts, space)
-    return hidden(edges, safe_norm(edges.grasp_map[..., 2].sum(-2)))
+    residual = safe_norm(edges.grasp_map[..., 2].sum(-2))
+    # Opposite normals cancel but for rounding, by which grasps would be ranked.
+    rounding = 16 * jnp.finfo(residual.dtype).eps * edges.present.sum(-1, dtype=residual.dtype)
+    return hidden(edges, jnp.where(residual > rounding, residual, 0))
 
 
 def _extreme(blocks: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -79,4 +84,5 @@ def _extreme(blocks: jax.Array) -> tuple[jax.Array, jax.Array]:
     held = lax.stop_gradient(G)
     u = jnp.linalg.eigh(held @ jnp.swapaxes(held, -1, -2))[1]
     length = lambda column: safe_norm(jnp.einsum("...ij,...i->...j", G, column))  # noqa: E731
-    return length(u[..., 0]), length(u[..., -1])
+    smallest, largest = length(u[..., 0]), length(u[..., -1])
+    return jnp.where(smallest > RANK_TOLERANCE[G.dtype.name] * largest, smallest, 0), largest

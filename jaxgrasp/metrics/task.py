@@ -3,13 +3,15 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import broadcast_batch
+from jaxgrasp.arrays import broadcast_batch, safe_norm
 from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of
 from jaxgrasp.solvers import solve_qp
 from jaxgrasp.solvers.status import Status
+
+_ROUNDING = {"float64": 1e-8, "float32": 1e-4}
 
 
 def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
@@ -30,8 +32,8 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
         space: conventions; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), 0 where some wrench cannot be exerted, inf without any; NaN for data that are not admissible or a
-        program that could not be solved. Differentiable.
+        (*batch,), exactly 0 where some wrench cannot be exerted, inf without any; NaN for data that are not admissible
+        or a program that could not be solved. Differentiable.
 
     Raises:
         ValueError: a set that is not given by vertices, options or shapes that do not fit.
@@ -39,7 +41,10 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
     edges = edges_of(contacts, space)
     terms = task.terms
     if len(terms) != 1 or not isinstance(terms[0], Vertices) or terms[0].width is not None:
-        raise ValueError("task: got a set without vertices, wanted DisturbanceSet.vertices or DisturbanceSet.forces")
+        raise ValueError(
+            "task: got a set without vertices, wanted DisturbanceSet.vertices or DisturbanceSet.forces "
+            "(--disturbances forces or a FILE)"
+        )
     W, dtype = edges.flat, edges.wrenches.dtype
     vertices = terms[0].wrenches.astype(dtype)
     batch = broadcast_batch(contacts=edges.valid.shape, task=vertices.shape[:-2])
@@ -64,5 +69,8 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
         jnp.zeros(rows.shape[-2], dtype),
     )
     each = jnp.where(found.status == Status.SOLVED, jnp.where(counted, found.objective, 0), jnp.nan)
+    # The solver tells a wrench from zero to this share of the longest one that the fingers can exert.
+    longest = jnp.max(safe_norm(W), -1, initial=0)[..., None]
+    each = jnp.where(each * safe_norm(wanted) <= _ROUNDING[dtype.name] * longest, 0, each)
     value = jnp.min(jnp.where(counted, each, jnp.inf), -1)
-    return jnp.where(valid, jnp.maximum(value, 0), jnp.nan)
+    return jnp.where(valid, value, jnp.nan)

@@ -4,6 +4,7 @@ from jaxgrasp.ranking.comparison import MetricComparison, Prediction, compare_me
 from jaxgrasp.ranking.rank import Ranking, RankingInterrupted, rank
 from jaxgrasp.ranking.scores import check_metrics, score
 from jaxgrasp.ranking.table import TABLE_ENDINGS, ranking_table, write_table
+from jaxgrasp.ranking.zero_margins import is_zero, why_zero
 
 __all__ = [
     "TABLE_ENDINGS",
@@ -13,8 +14,10 @@ __all__ = [
     "RankingInterrupted",
     "check_metrics",
     "compare_metrics",
+    "is_zero",
     "rank",
     "ranking_table",
     "score",
+    "why_zero",
     "write_table",
 ]

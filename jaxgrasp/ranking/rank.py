@@ -168,7 +168,8 @@ class _Scores:
         return _Scores(margin=margin, upper_bound=upper_bound, status=status, metrics=metrics, done=0)
 
     def fill(self, rows: slice, margin: np.ndarray, upper_bound: np.ndarray, status: np.ndarray) -> None:
-        self.margin[rows], self.upper_bound[rows], self.status[rows] = margin, upper_bound, status
+        # Minus zero is zero.
+        self.margin[rows], self.upper_bound[rows], self.status[rows] = margin + 0.0, upper_bound + 0.0, status
         self.done = rows.stop
 
     def order(self) -> np.ndarray:
@@ -205,8 +206,8 @@ class _Scores:
             status=self.status[: self.done],
             order=order,
             share=share,
-            forces=forces,
-            object_forces=object_forces,
+            forces=forces + 0.0,
+            object_forces=object_forces + 0.0,
             effort=effort,
             tightening_status=tightening_status,
             controls=controls,

@@ -62,14 +62,15 @@ def score(
         own = name == "margin"
         settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None if own else _TILE, "spread": own}
         for rows, value in solve_in_tiles(_scorer(name, cone_edges), columns, disturbances, **settings):
-            values[rows] = value
+            values[rows] = value + 0.0  # minus zero is zero
             report(rows.stop)
         return values
     setting = Setting(disturbances=disturbances, cone_edges=cone_edges, task={})
     contacts = jax.tree.map(np.asarray, contacts_of(columns))
-    for row in range(len(candidates)):
+    # A grasp with more contacts than a metric can take is refused first, not after hours.
+    for done, row in enumerate(np.argsort(-candidates.active.sum(1), kind="stable"), 1):
         values[row] = METRICS[name].value(jax.tree.map(lambda leaf, at=row: leaf[at], contacts), setting)
-        report(row + 1)
+        report(done)
     return values
 
 

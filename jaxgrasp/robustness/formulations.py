@@ -129,7 +129,8 @@ def check_vertices(disturbances: DisturbanceSet) -> None:
     terms = getattr(disturbances, "terms", None)
     if terms is not None and (len(terms) != 1 or not isinstance(terms[0], Vertices) or terms[0].width is not None):
         raise ValueError(
-            "disturbances: got a set that is not given by vertices, wanted a single DisturbanceSet.vertices or .forces"
+            "disturbances: got a set that is not given by vertices, wanted a single DisturbanceSet.vertices or .forces "
+            "(--disturbances forces or a FILE)"
         )
 
 

@@ -55,7 +55,7 @@ def _draw_correlation(axes: Axes, comparison: MetricComparison) -> None:
     axes.imshow(comparison.correlation, cmap="RdBu", vmin=-1, vmax=1)
     for row, column in np.ndindex(count, count):
         value = comparison.correlation[row, column]
-        text = f"{value:.2f}" if np.isfinite(value) else "-"
+        text = f"{value:z.2f}" if np.isfinite(value) else "-"
         colour = "white" if abs(value) > 0.7 else "black"
         axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
     axes.set_xticks(range(count), comparison.names, rotation=90, fontsize=8)

@@ -127,7 +127,7 @@ def _draw_panel(panel: Any, ranking: Ranking, place: int, unit: str, loaded: boo
     )
     source = Path(candidates.sources[candidates.source[row]]).stem
     name = candidates.columns["object_name"][row] if "object_name" in candidates.columns else source
-    margin = f"{ranking.margin[row]:.3g}" if np.isfinite(ranking.margin[row]) else r"\infty"
+    margin = f"{ranking.margin[row]:z.3g}" if np.isfinite(ranking.margin[row]) else r"\infty"
     title = f"#{place + 1}: {name}, candidate {candidates.index[row]}\n$\\lambda = {margin}$ {unit}"
     panel.set_title(
         f"{title}; arrows: 1 mm = {scale:.2g} N" if np.isfinite(scale) else f"{title}; no forces", fontsize=9, y=1.02

@@ -1,0 +1,106 @@
+"""Why margins are zero: what the contacts of a grasp lack, in words."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxgrasp.contact import Contacts
+from jaxgrasp.contact.compliance import RANK_TOLERANCE
+from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.metrics import WrenchSpace
+from jaxgrasp.metrics.interior import contains_origin
+from jaxgrasp.metrics.wrench_space import edges_of
+from jaxgrasp.solvers.status import Status
+
+# Of more grasps than this the reasons of so many are found, evenly spread over them.
+_LOOKED_AT = 1_000
+
+_REASONS = {
+    "contact": "without contacts",
+    "line": "with contacts on one line (as two always are), about which hard contacts do not resist a turn",
+    "friction": "without friction",
+    "closure": "without force closure: no forces inside the friction cones squeeze the object",
+    "slippery": "with force closure, but with contacts without friction, which take no share of a disturbance",
+    "spare": "with force closure, to which the load, the largest forces or the actuators leave no force to spare",
+}
+# Multiples of the disturbances below which a margin is none.
+_SMALLEST_MARGIN = 1e-6
+
+
+def is_zero(margin: Float[np.ndarray, " batch"], status: Int[np.ndarray, " batch"]) -> Bool[np.ndarray, " batch"]:
+    """Whether a margin (21) that was found is none.
+
+    Args:
+        margin: Multiples of the disturbances.
+        status: `Status` of each.
+    """
+    return (status == Status.SOLVED) & (margin <= _SMALLEST_MARGIN)
+
+
+def why_zero(
+    contacts_of: Callable[[Int[np.ndarray, " rows"]], Contacts],
+    zero: Bool[np.ndarray, " batch"],
+    disturbances: DisturbanceSet,
+    *,
+    cone_edges: int = 8,
+) -> list[str]:
+    """Find out why the margins (21) of grasps are zero.
+
+    Args:
+        contacts_of: Makes the contacts of some grasps by their numbers, with one batch axis: there may be too many for
+            all at once.
+        zero: Which grasps have a margin of zero.
+        disturbances: The set that the margins scale, the same for all.
+        cone_edges: Edges of the friction pyramid.
+
+    Returns:
+        A line for each reason that there is, with the number of grasps, the commonest first; of large numbers of grasps
+        the shares are those of a part.
+    """
+    rows = np.flatnonzero(zero)
+    if not len(rows):
+        return []
+    looked_at = rows[:: -(-len(rows) // _LOOKED_AT)]
+    found = _reasons(contacts_of(looked_at), disturbances, cone_edges)
+    of = "" if len(looked_at) == len(rows) else f" of {len(looked_at):,} looked at"
+    counts = {reason: int((found == number).sum()) for number, reason in enumerate(_REASONS)}
+    return [
+        f"{count:,}{of} {_REASONS[reason]}"
+        for reason, count in sorted(counts.items(), key=lambda item: -item[1])
+        if count
+    ]
+
+
+def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) -> np.ndarray:
+    """The place of each grasp's reason in `_REASONS`."""
+    edges = edges_of(contacts, WrenchSpace(cone_edges=cone_edges))
+    G = np.moveaxis(np.asarray(edges.grasp_map), -3, -2).reshape(*edges.valid.shape, 6, -1)
+    left, found, _ = np.linalg.svd(G)
+    singular = np.zeros((len(G), 6), G.dtype)
+    singular[:, : found.shape[-1]] = found
+    # Rows: directions of wrenches, and which of them no contact forces exert.
+    directions = np.swapaxes(left, -1, -2)
+    unreached = singular <= RANK_TOLERANCE[G.dtype.name] * singular[:, :1]
+    twists = np.concatenate([directions[..., :3], directions[..., 3:] / np.asarray(edges.length)[:, None, None]], -1)
+    extent = np.maximum(disturbances.support(twists), disturbances.support(-twists))
+    disturbed = np.where(unreached, extent, 0).max(-1) > RANK_TOLERANCE[G.dtype.name] * extent.max(-1)
+
+    # With both signs of what is lacking, the hull of the wrenches has the origin inside where it has it in their span.
+    lacking = jnp.asarray(np.where(unreached[..., None], directions, 0))
+    W = jnp.concatenate([edges.flat, lacking, -lacking], -2)
+    longest = jnp.sqrt(jnp.max(jnp.sum(W * W, -1), -1))
+    closed = jax.jit(jax.vmap(contains_origin))(W / jnp.where(longest > 0, longest, 1)[..., None, None])
+
+    slippery = edges.present & (jnp.where(edges.present, contacts.friction, 1) == 0)
+    conditions = {
+        "contact": ~edges.present.any(-1),
+        "line": disturbed,
+        "friction": (slippery == edges.present).all(-1),
+        "closure": ~closed,
+        "slippery": slippery.any(-1),
+        "spare": jnp.ones_like(closed),
+    }
+    return np.argmax(np.stack([np.asarray(conditions[reason]) for reason in _REASONS]), axis=0)
