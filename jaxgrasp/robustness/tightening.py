@@ -428,7 +428,7 @@ def _solve_effort(grasps: Grasps, program: Program, first: Solution, record: Rec
     forces = program.forces(best.x[0]) * blocks.present[:, None]
     multipliers = best.z[0] * unit**2 / program.row_units()
     solution = Solution(
-        margin=hide(attained),
+        margin=hide(jnp.where(attained > first.upper_bound, first.upper_bound, attained)),
         upper_bound=first.upper_bound,
         forces=hide(forces),
         effort=hide(effort_of(forces, grasps.weights)),
