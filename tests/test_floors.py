@@ -11,6 +11,7 @@ FLOORS = {
     "arrays": 0,
     "compiling": 0,
     "fence": 0,
+    "storage": 0,
     "kernels": 1,
     "geometry": 2,
     "contact": 2,

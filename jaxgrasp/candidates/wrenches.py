@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxgrasp.candidates.archive import CandidateError, read_archive, read_array
+from jaxgrasp.candidates.reader import CandidateError
+from jaxgrasp.storage import open_archive, read_array
 
 
 def read_wrenches(path: Path | str) -> Float[np.ndarray, "directions 6"]:
@@ -25,12 +26,12 @@ def read_wrenches(path: Path | str) -> Float[np.ndarray, "directions 6"]:
     if path.suffix == ".npy":
         field, wrenches = None, read_array(path)
     else:
-        field, arrays = "wrenches", read_archive(path)
-        if field not in arrays:
-            raise CandidateError(
-                path, field, f"no such field (there is {', '.join(arrays) or 'nothing'})", "wrenches (n_d, 6)"
-            )
-        wrenches = arrays[field]
+        field = "wrenches"
+        with open_archive(path) as archive:
+            if field not in archive.headers:
+                there = ", ".join(archive.headers) or "nothing"
+                raise CandidateError(path, field, f"no such field (there is {there})", "wrenches (n_d, 6)")
+            wrenches = archive.read([field])[field]
     if wrenches.dtype.kind not in "iuf" or wrenches.ndim != 2 or wrenches.shape[0] == 0 or wrenches.shape[1] != 6:
         raise CandidateError(path, field, f"dtype {wrenches.dtype}, shape {wrenches.shape}", "real numbers (n_d, 6)")
     if not np.isfinite(wrenches).all():
