@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from jaxgrasp.cli import signals
 from jaxgrasp.ranking import MetricComparison, Ranking
 from jaxgrasp.solvers.status import Status
 
@@ -33,8 +34,9 @@ class Clock:
         self.ticks: list[tuple[float, int]] = []
 
     def tick(self, done: int) -> None:
-        """Notes that so many candidates are done."""
-        self.ticks.append((time.perf_counter(), done))
+        """Notes that so many candidates are done, once."""
+        if not self.ticks or done > self.ticks[-1][1]:
+            self.ticks.append((time.perf_counter(), done))
 
     def __str__(self) -> str:
         """Returns how long it took and, where more than one tile was solved, how many a second after the first."""
@@ -64,6 +66,7 @@ def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
         def show(done: int) -> None:
             clock.tick(done)
             progress.update(task, completed=done, description="ranking" if done < total else "tightening")
+            signals.checkpoint()
 
         yield show
 
@@ -104,6 +107,7 @@ def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
         def show(done: int, record: "Record") -> None:
             text = f"margin: median {record.median[-1]:.3g}, best {record.best[-1]:.3g}"
             progress.update(task, completed=done, description=text)
+            signals.checkpoint()
 
         yield show
 
@@ -128,6 +132,7 @@ def hand_bar(starts: int, steps: int) -> Iterator[Callable[[int, int, dict[str, 
             middle = ", ".join(f"{name} {rows[-1, rows.shape[1] // 2]:.2f}" for name, rows in record.items())
             text = middle.replace("_", "-") if done < total else f"closing fingers and judging {starts:,} grasps"
             progress.update(task, completed=done, total=total, description=text)
+            signals.checkpoint()
 
         yield show
 

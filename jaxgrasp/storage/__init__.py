@@ -2,7 +2,7 @@
 
 from jaxgrasp.storage.arrays import Archive, Header, open_archive, read_archive, read_array
 from jaxgrasp.storage.cache import cache_folder
-from jaxgrasp.storage.reading import FileError, allowance, limited_to, open_regular, printable
+from jaxgrasp.storage.reading import FileError, allowance, limited_to, open_regular, printable, reason_of
 from jaxgrasp.storage.writing import atomic_write, check_writable, discard_unfinished, unfinished
 
 __all__ = [
@@ -20,5 +20,6 @@ __all__ = [
     "printable",
     "read_archive",
     "read_array",
+    "reason_of",
     "unfinished",
 ]
