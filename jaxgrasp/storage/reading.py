@@ -49,12 +49,13 @@ def allowance() -> int:
 
 
 @contextlib.contextmanager
-def open_regular(path: Path | str, wanted: str = "a regular file") -> Iterator[BinaryIO]:
+def open_regular(path: Path | str, wanted: str = "a regular file", cost: int = 1) -> Iterator[BinaryIO]:
     """Opens a file for reading: a regular one, which has an end and keeps nobody waiting.
 
     Args:
         path: The file.
         wanted: What the file should be, for the message.
+        cost: Bytes of memory that a byte of the file takes once it is read.
 
     Yields:
         A stream of bytes.
@@ -65,7 +66,7 @@ def open_regular(path: Path | str, wanted: str = "a regular file") -> Iterator[B
     try:
         # A pipe that nobody writes to must not keep us waiting, nor a terminal become ours.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
-        _check(path, os.stat(path), wanted)
+        _check(path, os.stat(path), wanted, cost)
         stream = open(os.open(path, flags), "rb")
     except (OSError, ValueError) as error:
         if isinstance(error, FileError):
@@ -73,7 +74,7 @@ def open_regular(path: Path | str, wanted: str = "a regular file") -> Iterator[B
         raise FileError(path, None, reason_of(error), wanted) from error
     with stream:
         # The name may have come to mean another file since.
-        _check(path, os.fstat(stream.fileno()), wanted)
+        _check(path, os.fstat(stream.fileno()), wanted, cost)
         yield stream
 
 
@@ -84,11 +85,11 @@ def reason_of(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-def _check(path: Path | str, found: os.stat_result, wanted: str) -> None:
+def _check(path: Path | str, found: os.stat_result, wanted: str, cost: int) -> None:
     if not stat.S_ISREG(found.st_mode):
         raise FileError(path, None, _KINDS.get(stat.S_IFMT(found.st_mode), "no regular file"), wanted)
-    if found.st_size > allowance():
-        limit = f"at most {in_bytes(allowance())} (see --read-limit)"
+    if cost * found.st_size > allowance():
+        limit = f"at most {in_bytes(allowance() / cost)} (see --read-limit)"
         raise FileError(path, None, f"a file of {in_bytes(found.st_size)}", limit)
 
 
@@ -101,7 +102,7 @@ _KINDS = {
 }
 
 
-def in_bytes(size: int) -> str:
+def in_bytes(size: float) -> str:
     """A number of bytes with a unit that suits it."""
     for unit in ("bytes", "KiB", "MiB", "GiB"):
         if size < 1024:
