@@ -8,6 +8,9 @@ from jaxtyping import Float
 from jaxgrasp.candidates.reader import CandidateError
 from jaxgrasp.storage import open_archive, read_array
 
+# Each is looked at for every grasp in every step; a ball's surface is no rounder for more of them.
+_MOST = 10_000
+
 
 def read_wrenches(path: Path | str) -> Float[np.ndarray, "directions 6"]:
     """Reads disturbance wrenches, whose convex hull with the origin is the set of disturbances.
@@ -34,6 +37,8 @@ def read_wrenches(path: Path | str) -> Float[np.ndarray, "directions 6"]:
             wrenches = archive.read([field])[field]
     if wrenches.dtype.kind not in "iuf" or wrenches.ndim != 2 or wrenches.shape[0] == 0 or wrenches.shape[1] != 6:
         raise CandidateError(path, field, f"dtype {wrenches.dtype}, shape {wrenches.shape}", "real numbers (n_d, 6)")
+    if len(wrenches) > _MOST:
+        raise CandidateError(path, field, f"{len(wrenches):,} wrenches", f"at most {_MOST:,}, corners of their hull")
     if not np.isfinite(wrenches).all():
         raise CandidateError(path, field, "NaN or infinite entries", "finite wrenches")
     return wrenches.astype(np.float64)

@@ -19,7 +19,7 @@ import mujoco
 from jaxgrasp.storage import FileError, allowance, open_regular
 
 _WANTED = "a model in MJCF or URDF"
-# A quarter of the budget is for the compiler, beside what it takes itself; and three seconds for each GiB of the budget.
+# The compiler may have a quarter of the budget, beside what it takes itself, and three seconds for each GiB of it.
 _SHARE, _OWN, _SECONDS = 4, 300 << 20, 3.0
 # Elements of XML take more than their text.
 _XML_COST = 16

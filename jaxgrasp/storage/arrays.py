@@ -25,6 +25,7 @@ _BROKEN += (zipfile.BadZipFile, zlib.error, struct.error)
 _MAGIC = b"\x93NUMPY"
 # NumPy's own parser takes headers of up to 10,000 characters.
 _HEADER = 10_240
+_DIMENSIONS = 32
 _CHUNK = 1 << 18
 _MEMBERS, _DIRECTORY = 10_000, 4 << 20
 # Archives of zeros shrink a thousandfold; grasps, hardly at all. Small members, such as a constant column of a million
@@ -246,7 +247,8 @@ def _parsed(path: Path, name: str | None, start: bytes) -> Header:
         # NumPy reads the header as a Python literal, and answers with any exception that this can end in.
         raise FileError(path, name, f"a damaged header ({type(error).__name__})", "an array of numpy.save") from error
     # Truth values are integers to Python, and to NumPy.
-    if any(type(length) is not int or not 0 <= length < 2**62 for length in shape) or dtype.subdtype is not None:
+    whole = all(type(length) is int and 0 <= length < 2**62 for length in shape)
+    if not whole or len(shape) > _DIMENSIONS or dtype.subdtype is not None:
         raise FileError(path, name, "a header that declares no array", "an array of numpy.save")
     return Header(shape, dtype, fortran_order, stream.tell())
 
