@@ -18,6 +18,8 @@ FIELDS = ("positions", "outward_normals", "frames", "friction", "max_force", "ma
 # while 'mask' is 0.75 from 'mass'. A field that is required and missing is sought from further away ('normals').
 _SURELY_MEANT = 0.8
 _PERHAPS_MEANT = 0.55
+# Programs are compiled for a number of contacts, and with hundreds of them that has no end.
+_MOST_CONTACTS = 64
 
 
 def read_candidates(
@@ -113,6 +115,8 @@ def _of_candidates(path: Path, archive: Archive) -> dict[str, np.ndarray]:
         raise CandidateError(path, "positions", f"shape {shape}", "(N, n_c, 3)")
     if shape[0] == 0:
         raise CandidateError(path, "positions", f"no candidates (shape {shape})", "at least one")
+    if shape[1] > _MOST_CONTACTS:
+        raise CandidateError(path, "positions", f"{shape[1]:,} contacts", f"at most {_MOST_CONTACTS} a candidate")
     return archive.read(name for name in headers if name in FIELDS or headers[name].shape[:1] == shape[:1])
 
 

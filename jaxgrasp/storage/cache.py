@@ -27,7 +27,7 @@ def _base() -> Path:
     # The standard says that a relative one is to be passed over.
     if given and os.path.isabs(given):
         return Path(given)
-    try:
-        return Path.home() / ".cache"
-    except RuntimeError as error:
-        raise FileNotFoundError("there is no home folder, and no XDG_CACHE_HOME") from error
+    home = os.path.expanduser("~")
+    if not os.path.isabs(home):
+        raise FileNotFoundError("there is no home folder, and no XDG_CACHE_HOME")
+    return Path(home, ".cache")
