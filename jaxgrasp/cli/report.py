@@ -64,9 +64,9 @@ def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
         task = progress.add_task("compiling", total=total)
 
         def show(done: int) -> None:
+            signals.checkpoint()
             clock.tick(done)
             progress.update(task, completed=done, description="ranking" if done < total else "tightening")
-            signals.checkpoint()
 
         yield show
 
@@ -105,9 +105,9 @@ def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
         task = progress.add_task("compiling", total=steps)
 
         def show(done: int, record: "Record") -> None:
+            signals.checkpoint()
             text = f"margin: median {record.median[-1]:.3g}, best {record.best[-1]:.3g}"
             progress.update(task, completed=done, description=text)
-            signals.checkpoint()
 
         yield show
 
@@ -129,10 +129,10 @@ def hand_bar(starts: int, steps: int) -> Iterator[Callable[[int, int, dict[str, 
         task = progress.add_task("compiling", total=steps)
 
         def show(done: int, total: int, record: dict[str, np.ndarray]) -> None:
+            signals.checkpoint()
             middle = ", ".join(f"{name} {rows[-1, rows.shape[1] // 2]:.2f}" for name, rows in record.items())
             text = middle.replace("_", "-") if done < total else f"closing fingers and judging {starts:,} grasps"
             progress.update(task, completed=done, total=total, description=text)
-            signals.checkpoint()
 
         yield show
 
