@@ -21,6 +21,8 @@ from jaxgrasp.storage import FileError, allowance, open_regular
 _WANTED = "a model in MJCF or URDF"
 # The compiler may have a quarter of the budget, beside what it takes itself, and three seconds for each GiB of it.
 _SHARE, _OWN, _SECONDS = 4, 300 << 20, 3.0
+# On the clock, for whatever keeps it waiting without computing.
+_PATIENCE = 60.0
 # Elements of XML take more than their text.
 _XML_COST = 16
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
@@ -41,9 +43,11 @@ def compile_file(path: str | os.PathLike) -> mujoco.MjModel:
         model = Path(folder, "model.mjb")
         limits = [str(allowance() // _SHARE + _OWN), str(max(1, round(_SECONDS * allowance() / 2**30)))]
         command = [sys.executable, "-P", str(Path(__file__).with_name("compiler.py")), str(path.absolute()), str(model)]
-        child = subprocess.run(
-            [*command, *limits], cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-        )
+        streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        try:
+            child = subprocess.run([*command, *limits], cwd=folder, timeout=_PATIENCE, **streams)
+        except subprocess.TimeoutExpired as error:
+            raise FileError(path, None, f"a model that takes more than {_PATIENCE:g} s to compile", _WANTED) from error
         if child.returncode == 0:
             return mujoco.MjModel.from_binary_path(str(model))
     said = child.stdout.decode("utf-8", "replace").strip()
@@ -65,14 +69,22 @@ def check_files(path: str | os.PathLike) -> None:
         FileError: One of them cannot be used, the XML is not well-formed or has a document type, or a model is part of
             itself.
     """
-    path = Path(path)
-    _Look(path.parent).at(path, ())
+    look = _Look(Path(path).parent)
+    look.at(Path(path), ())
+    for place in (folder / name for folder in look.folders for name in look.names):
+        if os.path.lexists(place):
+            with open_regular(place):
+                pass
 
 
 class _Look:
-    """A look at a model file and all that it names."""
+    """A look at a model file and at all models that it names."""
 
     def __init__(self, root: Path):
+        self.folders: set[Path] = {root}
+        """Where files may be looked for: what one model says of that may hold for another."""
+        self.names: set[str] = set()
+        """Of meshes, height fields, textures and the like."""
         self._root = root
         self._seen: set[str] = set()
 
@@ -85,27 +97,19 @@ class _Look:
             return
         self._seen.add(name)
         elements = _elements(path)
-        folders = {path.parent, self._root}
         given = {attributes[key] for _, attributes in elements for key in _FOLDERS if key in attributes}
-        folders |= {folder / other for folder in tuple(folders) for other in given}
+        self.folders |= {path.parent} | {folder / other for folder in (self._root, path.parent) for other in given}
         for tag, attributes in elements:
-            for key, value in attributes.items():
-                if key.startswith("file"):
-                    self._named(path, tag, value, folders, (*above, name))
-                elif key == "filename" or key == "url":
-                    self._named(path, tag, value.removeprefix("file://"), folders, (*above, name))
-
-    def _named(self, path: Path, tag: str, name: str, folders: set[Path], above: tuple[str, ...]) -> None:
-        if tag == "include" and (os.path.isabs(name) or ".." in Path(name).parts):
-            raise FileError(path, "include", repr(name), "a file beside this one or in a folder there")
-        for place in (folder / name for folder in folders):
-            if not os.path.lexists(place):
+            named = [value for key, value in attributes.items() if key.startswith("file") or key == "url"]
+            if tag not in ("include", "model"):
+                self.names |= {value.removeprefix("file://") for value in named}
                 continue
-            if tag in ("include", "model"):
-                self.at(place, above)
-            else:
-                with open_regular(place):
-                    pass
+            for other in named:
+                if tag == "include" and (os.path.isabs(other) or ".." in Path(other).parts):
+                    raise FileError(path, "include", repr(other), "a file beside this one or in a folder there")
+                for place in (folder / other for folder in tuple(self.folders)):
+                    if os.path.lexists(place):
+                        self.at(place, (*above, name))
 
 
 def _elements(path: Path) -> list[tuple[str, dict[str, str]]]:
