@@ -139,13 +139,15 @@ def archives(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
         )
     std = [(f"{name}.npy", member(value)) for name, value in good.items()]
     for label in (
-        "größe_猫", "a\nb", "\x1b[31mred", "[red]x[/red]", "a\x00b", "n" * 60000, "a/b", 'comma,"b"', "", "file", "rank",
+        "größe_猫", "a\nb", "\x1b[31mred", "[red]x[/red]", "a\x00b", "n" * 60000, "a/b", 'comma,"b"', "", "file",
+        "rank",
         "forces_0_x", "margin", "..", "\u202egnp", "../../x", "/etc/x", "$\\frac$", "positions ", "Positions", "x" * 5,
     ):  # fmt: skip
         yield "column_named", zipped([*std, (f"{label}.npy", member(np.arange(6.0)))])
     for label, value in {
         "wide": np.full(6, "x" * 200_000), "nul": np.array(["a\x00b", "\x1b[31m", "[bold]", "x\ny", "", "\u202e"]),
-        "surrogates": np.array(["\ud800"] * 6), "bytes": np.array([b"\xff\xfe"] * 6), "dollars": np.full(6, "a$b$\\c_{"),
+        "surrogates": np.array(["\ud800"] * 6), "bytes": np.array([b"\xff\xfe"] * 6),
+        "dollars": np.full(6, "a$b$\\c_{"),
         "big_endian": np.full(6, "ab").astype(">U2"), "nothing": np.zeros((6, 0)), "many": np.zeros((6, 3000)),
         "dimensions": np.zeros((6,) + (1,) * 30), "booleans": np.frombuffer(bytes([0, 1, 2, 3, 255, 128]), bool),
         "large": np.full(6, 2**63 + 1, "u8"), "text": np.full((6, 3), "abc"), "date": np.zeros(6, "M8[s]"),

@@ -177,7 +177,7 @@ def main() -> None:
     given = options.parse_args()
     draw = random.Random(0)
     lines = [
-        "| writer | it takes, s | kills | old file | new file | broken | gone | litter after a kill | after the next run |"
+        "| writer | it takes, s | kills | old file | new file | broken | gone | litter after a kill | after a run |"
     ]
     lines.append("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
     with tempfile.TemporaryDirectory() as name:

@@ -194,7 +194,6 @@ def main() -> None:
     import jaxgrasp.geometry
     import jaxgrasp.hands.scenes
     import jaxgrasp.ranking
-    import jaxgrasp.geometry
     import jaxgrasp.viewer  # noqa: F401
 
     with tempfile.TemporaryDirectory() as folder:

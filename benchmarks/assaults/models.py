@@ -15,8 +15,8 @@ def models(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
     def scene(head: str = "", bodies: str = "", tail: str = "", joint: str = "", geom: str = "") -> bytes:
         return (
             f'<mujoco>{head}<worldbody><body name="object" pos="0 0 0.1"><freejoint/><geom size="0.02" {geom}/></body>'
-            f'<body name="palm"><geom size="0.01"/><body pos="0 0 .03"><joint name="j" {joint}/><geom size="0.01"/></body>'
-            f"</body>{bodies}</worldbody>{tail}</mujoco>"
+            f'<body name="palm"><geom size="0.01"/><body pos="0 0 .03"><joint name="j" {joint}/>'
+            f'<geom size="0.01"/></body></body>{bodies}</worldbody>{tail}</mujoco>'
         ).encode()
 
     good = scene(tail='<actuator><position joint="j" kp="1"/></actuator>')
@@ -125,5 +125,6 @@ def models(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
     yield "urdf", b'<robot name="r"><link name="object"/></robot>'
     yield (
         "urdf_mesh",
-        b'<robot name="r"><link name="object"><collision><geometry><mesh filename="pipe.stl"/></geometry></collision></link></robot>',
+        b'<robot name="r"><link name="object"><collision><geometry><mesh filename="pipe.stl"/></geometry></collision>'
+        b"</link></robot>",
     )

@@ -57,7 +57,8 @@ def obj(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
     yield "mtllib_zero", b"mtllib /dev/zero\nusemtl a\n" + good
     yield "mtllib_absent", b"mtllib nothing.mtl\nusemtl a\n" + good
     for label, line in {
-        "beyond": "f 1 2 9\n", "zero": "f 0 1 2\n", "negative": "f -1 -2 -3\n", "two": "f 1 2\n", "float": "f 1.5 2 3\n",
+        "beyond": "f 1 2 9\n", "zero": "f 0 1 2\n", "negative": "f -1 -2 -3\n", "two": "f 1 2\n",
+        "float": "f 1.5 2 3\n",
         "huge": "f 99999999999999999999 1 2\n", "slashes": "f 1// 2// 3//\n", "wrong": "f 1/9/9 2/9/9 3/9/9\n",
         "many": "f " + "1 2 3 " * 5000 + "\n", "words": "f a b c\n", "only": "f\n",
     }.items():  # fmt: skip
@@ -94,7 +95,8 @@ def ply(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
             yield f"vertices_{number[:12]}", header(kind, vertices=number) + content
             yield f"faces_{number[:12]}", header(kind, faces=number) + content
         for extra in (
-            "comment TextureFile /dev/zero\n", "comment TextureFile pipe\n", "element void 1000000000\n", "property int x\n",
+            "comment TextureFile /dev/zero\n", "comment TextureFile pipe\n", "element void 1000000000\n",
+            "property int x\n",
             "element vertex 4\n", "obj_info x\n", "element\n", "property list\n",
         ):  # fmt: skip
             yield "extra", header(kind, extra=extra) + content
