@@ -1,48 +1,28 @@
-"""Rank multi-fingered grasps by how strong a disturbance they withstand, in batch, with the forces that do it."""
+"""Rank multi-fingered grasps by how strong a disturbance they withstand, in batch, with the forces that do it.
 
-from jaxgrasp import metrics, solvers
-from jaxgrasp.contact import Actuation, Compliance, Contacts, grasp_map, required_wrench
-from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.robustness import (
-    Comparison,
-    FormulationSolution,
-    Solution,
-    SpecifiedDisturbances,
-    TotalEffortSolution,
-    audit,
-    blocking_forces,
-    compare_formulations,
-    formulation_margin,
-    largest_disturbance,
-    least_effort,
-    least_total_effort,
-    specified_disturbances,
-    worst_case,
-)
-from jaxgrasp.solvers.status import Status
+The package's names are those of `jaxgrasp.face`, which is imported when the first of them is used: JAX takes a second
+to import, in which the command line could not answer Ctrl-C.
+"""
 
-__all__ = [
-    "Actuation",
-    "Comparison",
-    "Compliance",
-    "Contacts",
-    "DisturbanceSet",
-    "FormulationSolution",
-    "Solution",
-    "SpecifiedDisturbances",
-    "Status",
-    "TotalEffortSolution",
-    "audit",
-    "blocking_forces",
-    "compare_formulations",
-    "formulation_margin",
-    "grasp_map",
-    "largest_disturbance",
-    "least_effort",
-    "least_total_effort",
-    "metrics",
-    "required_wrench",
-    "solvers",
-    "specified_disturbances",
-    "worst_case",
-]
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxgrasp.face import *  # noqa: F403
+    from jaxgrasp.face import __all__ as __all__
+
+
+def __getattr__(name: str) -> Any:
+    # Python itself looks for the face, and for names such as __path__.
+    if name == "face" or (name.startswith("__") and name != "__all__"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from jaxgrasp import face
+
+    value = getattr(face, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    from jaxgrasp import face
+
+    return sorted({*globals(), *face.__all__})

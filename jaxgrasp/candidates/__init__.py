@@ -1,9 +1,8 @@
 """The files that grasps come in by, and a built-in object to sample grasps on."""
 
-from jaxgrasp.candidates.archive import CandidateError, read_archive, read_array
 from jaxgrasp.candidates.candidates import Candidates, concatenate
 from jaxgrasp.candidates.plausibility import doubtful_conventions
-from jaxgrasp.candidates.reader import read_candidates
+from jaxgrasp.candidates.reader import CandidateError, read_candidates
 from jaxgrasp.candidates.superquadric import Superquadric, sample_grasps
 from jaxgrasp.candidates.wrenches import read_wrenches
 
@@ -13,8 +12,6 @@ __all__ = [
     "Superquadric",
     "concatenate",
     "doubtful_conventions",
-    "read_archive",
-    "read_array",
     "read_candidates",
     "read_wrenches",
     "sample_grasps",

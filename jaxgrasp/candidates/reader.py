@@ -1,21 +1,25 @@
 """Files of candidates: which fields there are, what shape each has, and what is wrong with one that cannot be used."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
-from jaxgrasp.candidates.archive import CandidateError, read_archive
 from jaxgrasp.candidates.candidates import Candidates, concatenate
+from jaxgrasp.storage import Archive, FileError, open_archive, printable
 
+# A file of candidates, or of wrenches, cannot be used.
+CandidateError = FileError
 FIELDS = ("positions", "outward_normals", "frames", "friction", "max_force", "mass", "center_of_mass", "active")
 
 # An unknown column this near to a known field that is absent is a misspelling: 'max_forces' is 0.95 from 'max_force',
 # while 'mask' is 0.75 from 'mass'. A field that is required and missing is sought from further away ('normals').
 _SURELY_MEANT = 0.8
 _PERHAPS_MEANT = 0.55
+# Programs are compiled for a number of contacts, and with hundreds of them that has no end.
+_MOST_CONTACTS = 64
 
 
 def read_candidates(
@@ -54,14 +58,11 @@ def read_candidates(
 
 
 def _read_file(path: Path, friction: float | None, max_force: float | None, with_mass: bool) -> Candidates:
-    arrays = read_archive(path)
-    _refuse_misspelt(path, arrays)
-    positions = _numbers(path, "positions", _required(path, arrays, "positions"))
-    if positions.ndim != 3 or positions.shape[2] != 3 or positions.shape[1] == 0:
-        raise CandidateError(path, "positions", f"shape {positions.shape}", "(N, n_c, 3)")
+    with open_archive(path, "an .npz file of candidates (numpy.savez)") as archive:
+        there = tuple(archive.headers)
+        arrays = _of_candidates(path, archive)
+    positions = _numbers(path, "positions", arrays["positions"])
     count, contacts = positions.shape[:2]
-    if count == 0:
-        raise CandidateError(path, "positions", f"no candidates (shape {positions.shape})", "at least one")
 
     def optional(name: str, shapes: Sequence[tuple[int, ...]]) -> np.ndarray | None:
         if name not in arrays:
@@ -75,7 +76,7 @@ def _read_file(path: Path, friction: float | None, max_force: float | None, with
         value = optional(name, ((), (count,), (count, contacts)))
         if value is None and given is None:
             option = "--" + name.replace("_", "-")
-            _missing(path, arrays, name, f"the column, or one value for all with {name}= ({option})")
+            _missing(path, there, name, f"the column, or one value for all with {name}= ({option})")
         value = np.asarray(given if value is None else value, dtype=float)
         return np.broadcast_to(value[:, None] if value.ndim == 1 else value, (count, contacts))
 
@@ -84,10 +85,10 @@ def _read_file(path: Path, friction: float | None, max_force: float | None, with
     frames = optional("frames", ((count, contacts, 3, 3),))
     normals = optional("outward_normals", ((count, contacts, 3),))
     if frames is None and normals is None:
-        _missing(path, arrays, "outward_normals", "outward_normals (N, n_c, 3) or frames (N, n_c, 3, 3)")
+        _missing(path, there, "outward_normals", "outward_normals (N, n_c, 3) or frames (N, n_c, 3, 3)")
     mass = optional("mass", ((), (count,)))
     if mass is None and with_mass:
-        _missing(path, arrays, "mass", "the column, because gravity needs it")
+        _missing(path, there, "mass", "the column, because gravity needs it")
     return Candidates(
         positions=positions,
         outward_normals=normals,
@@ -97,32 +98,41 @@ def _read_file(path: Path, friction: float | None, max_force: float | None, with
         active=_active(path, arrays.get("active"), (count, contacts)),
         mass=np.broadcast_to(np.nan if mass is None else mass, (count,)),
         columns=_travelling(path, arrays, count),
-        sources=(str(path),),
+        sources=(printable(path),),
         source=np.zeros(count, dtype=np.int32),
         index=np.arange(count, dtype=np.int64),
     )
 
 
-def _required(path: Path, arrays: dict[str, np.ndarray], name: str) -> np.ndarray:
-    if name not in arrays:
-        _missing(path, arrays, name, "the column")
-    return arrays[name]
+def _of_candidates(path: Path, archive: Archive) -> dict[str, np.ndarray]:
+    """Reads the arrays that have something to say of each candidate."""
+    headers = archive.headers
+    _refuse_misspelt(path, headers)
+    if "positions" not in headers:
+        _missing(path, headers, "positions", "the column")
+    shape = headers["positions"].shape
+    if len(shape) != 3 or shape[2] != 3 or shape[1] == 0:
+        raise CandidateError(path, "positions", f"shape {shape}", "(N, n_c, 3)")
+    if shape[0] == 0:
+        raise CandidateError(path, "positions", f"no candidates (shape {shape})", "at least one")
+    if shape[1] > _MOST_CONTACTS:
+        raise CandidateError(path, "positions", f"{shape[1]:,} contacts", f"at most {_MOST_CONTACTS} a candidate")
+    return archive.read(name for name in headers if name in FIELDS or headers[name].shape[:1] == shape[:1])
 
 
-def _missing(path: Path, arrays: dict[str, np.ndarray], name: str, wanted: str) -> NoReturn:
-    unknown = [other for other in arrays if other not in FIELDS]
+def _missing(path: Path, there: Collection[str], name: str, wanted: str) -> NoReturn:
+    unknown = [other for other in there if other not in FIELDS]
     near = _nearest(name, unknown, _PERHAPS_MEANT)
-    there = f"a similar {near!r}" if near else ", ".join(arrays) or "nothing"
-    got = f"no such column (there is {there})"
+    got = f"no such column (there is {f'a similar {near!r}' if near else ', '.join(there) or 'nothing'})"
     raise CandidateError(path, name, got, wanted)
 
 
-def _refuse_misspelt(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def _refuse_misspelt(path: Path, there: Collection[str]) -> None:
     # Passed over in silence, 'max_forces' would mean a ranking by other forces than the file's.
-    absent = [name for name in FIELDS if name not in arrays]
-    if "frames" in arrays or "outward_normals" in arrays:
+    absent = [name for name in FIELDS if name not in there]
+    if "frames" in there or "outward_normals" in there:
         absent = [name for name in absent if name not in ("frames", "outward_normals")]
-    for name in arrays:
+    for name in there:
         near = None if name in FIELDS else _nearest(name, absent, _SURELY_MEANT)
         if near:
             raise CandidateError(path, name, "an unknown field", f"{near!r}, the nearest known one, or another name")

@@ -5,7 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxgrasp.candidates.archive import CandidateError, read_archive, read_array
+from jaxgrasp.candidates.reader import CandidateError
+from jaxgrasp.storage import open_archive, read_array
+
+# Each is looked at for every grasp in every step; a ball's surface is no rounder for more of them.
+_MOST = 10_000
 
 
 def read_wrenches(path: Path | str) -> Float[np.ndarray, "directions 6"]:
@@ -25,14 +29,16 @@ def read_wrenches(path: Path | str) -> Float[np.ndarray, "directions 6"]:
     if path.suffix == ".npy":
         field, wrenches = None, read_array(path)
     else:
-        field, arrays = "wrenches", read_archive(path)
-        if field not in arrays:
-            raise CandidateError(
-                path, field, f"no such field (there is {', '.join(arrays) or 'nothing'})", "wrenches (n_d, 6)"
-            )
-        wrenches = arrays[field]
+        field = "wrenches"
+        with open_archive(path) as archive:
+            if field not in archive.headers:
+                there = ", ".join(archive.headers) or "nothing"
+                raise CandidateError(path, field, f"no such field (there is {there})", "wrenches (n_d, 6)")
+            wrenches = archive.read([field])[field]
     if wrenches.dtype.kind not in "iuf" or wrenches.ndim != 2 or wrenches.shape[0] == 0 or wrenches.shape[1] != 6:
         raise CandidateError(path, field, f"dtype {wrenches.dtype}, shape {wrenches.shape}", "real numbers (n_d, 6)")
+    if len(wrenches) > _MOST:
+        raise CandidateError(path, field, f"{len(wrenches):,} wrenches", f"at most {_MOST:,}, corners of their hull")
     if not np.isfinite(wrenches).all():
         raise CandidateError(path, field, "NaN or infinite entries", "finite wrenches")
     return wrenches.astype(np.float64)

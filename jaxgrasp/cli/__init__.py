@@ -1,5 +1,5 @@
 """The command `jaxgrasp`, one file a subcommand."""
 
-from jaxgrasp.cli.main import main
+from jaxgrasp.cli.main import main, program
 
-__all__ = ["main"]
+__all__ = ["main", "program"]

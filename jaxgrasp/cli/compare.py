@@ -1,6 +1,7 @@
 """`jaxgrasp compare`: how metrics agree on the grasps of a file, and with their success."""
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,9 @@ import tyro
 
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.problems import CommandError, check_output, warn_of_conventions, write_files
-from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
+from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
+from jaxgrasp.cli.streams import printing
+from jaxgrasp.storage import atomic_write
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -30,7 +33,7 @@ DEFAULT = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare:
+class Compare(Reading):
     """Compare metrics on the same grasps: how alike they rank them, and how well they predict success.
 
     Reads the files that `jaxgrasp rank` reads, computes metrics, and writes a table and a figure of Spearman's rank
@@ -128,7 +131,8 @@ class Compare:
             (self.output, lambda path: _write_table(found, path)),
             (self.figure, lambda path: write_figure(figure_of_comparison(found, outcome=outcome), path)),
         )
-        print_comparison(found, outcome, len(candidates), written)
+        with printing():
+            print_comparison(found, outcome, len(candidates), written)
         return 2 if failed else 0
 
     def _check(self) -> None:
@@ -175,18 +179,15 @@ class Compare:
 
 
 def _write_table(found: "MetricComparison", path: Path) -> None:
-    part = path.with_name(path.name + ".part")
     prediction = found.prediction
     areas = ["auc", "auc_low", "auc_high", "first_minus_this", "difference_low", "difference_high"]
-    try:
-        with part.open("w", newline="") as stream:
-            table = csv.writer(stream)
-            table.writerow(["metric", "answered", *(areas if prediction else []), *found.names])
-            for row, name in enumerate(found.names):
-                predicted = []
-                if prediction:
-                    predicted = [prediction.auc[row], *prediction.interval[row], *prediction.lead[row]]
-                table.writerow([name, found.answered[row], *predicted, *found.correlation[row]])
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    lines = io.StringIO(newline="")
+    table = csv.writer(lines)
+    table.writerow(["metric", "answered", *(areas if prediction else []), *found.names])
+    for row, name in enumerate(found.names):
+        predicted = []
+        if prediction:
+            predicted = [prediction.auc[row], *prediction.interval[row], *prediction.lead[row]]
+        table.writerow([name, found.answered[row], *predicted, *found.correlation[row]])
+    with atomic_write(path) as stream:
+        stream.write(lines.getvalue().encode("utf-8", "backslashreplace"))

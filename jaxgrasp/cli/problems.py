@@ -1,13 +1,16 @@
 """What can be found wrong with a command line before any long work, and with its files in the end."""
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
+
+from jaxgrasp.cli import signals
+from jaxgrasp.cli.streams import one_line
+from jaxgrasp.storage import check_writable, reason_of
 
 
 class CommandError(Exception):
@@ -44,17 +47,13 @@ def check_output(path: Path, option: str, endings: Sequence[str], inputs: Sequen
     """
     if path.suffix not in endings:
         raise CommandError(f"{option} {path}: got the ending {path.suffix!r}; wanted one of {', '.join(endings)}")
-    if any(path.resolve() == other.resolve() for other in inputs):
+    # Not by Path.resolve, which answers loops of links with an exception.
+    if any(os.path.realpath(path) == os.path.realpath(other) for other in inputs):
         raise CommandError(f"{option} {path}: this file is read from; wanted another one")
-    existed = path.exists()
     try:
-        # Permissions of the file's folder say little about read-only, full or remote ones: only opening it tells.
-        with path.open("ab"):
-            pass
-        if not existed:
-            os.unlink(path)
-    except OSError as error:
-        raise CommandError(f"{option} {path}: cannot be written ({(error.strerror or str(error)).lower()})") from error
+        check_writable(path)
+    except (OSError, ValueError) as error:
+        raise CommandError(f"{option} {path}: cannot be written ({reason_of(error)})") from error
 
 
 def warn_of_conventions(candidates: "Candidates") -> None:
@@ -67,7 +66,7 @@ def warn_of_conventions(candidates: "Candidates") -> None:
 
     doubts = doubtful_conventions(candidates)
     if doubts:
-        print(f"jaxgrasp: warning: {' | '.join(doubts)}", file=sys.stderr)
+        one_line(f"warning: {' | '.join(doubts)}")
 
 
 def write_files(*jobs: tuple[Path | None, Callable[[Path], None]]) -> tuple[list[Path], bool]:
@@ -78,15 +77,20 @@ def write_files(*jobs: tuple[Path | None, Callable[[Path], None]]) -> tuple[list
 
     Returns:
         The files that were written, and whether any could not be.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C came while one of them was written, which is whole then.
     """
     written, failed = [], False
     for path, write in jobs:
         if path is None:
             continue
+        signals.checkpoint()
         try:
             write(path)
             written.append(path)
+            signals.note_written(path)
         except OSError as error:
-            print(f"jaxgrasp: {path}: cannot be written ({error.strerror or error})", file=sys.stderr)
+            one_line(f"{path}: cannot be written ({error.strerror or error})")
             failed = True
     return written, failed

@@ -1,7 +1,6 @@
 """`jaxgrasp rank`: files of candidates in, a table and a figure out."""
 
 import math
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from jaxgrasp.cli import signals
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.problems import CommandError, check_options, check_output, warn_of_conventions, write_files
 from jaxgrasp.cli.scene import Scene
-from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
+from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
+from jaxgrasp.cli.streams import one_line, printing
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -25,7 +26,7 @@ SAMPLED = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rank:
+class Rank(Reading):
     """Rank candidate grasps by the largest disturbance that they resist.
 
     Reads .npz files with positions (N, n_c, 3), in m about the centre of mass, and outward_normals (N, n_c, 3) or
@@ -157,7 +158,7 @@ class Rank:
         from jaxgrasp.cli.report import print_ranking, progress_bar
         from jaxgrasp.ranking import RankingInterrupted, rank
 
-        exit_code = 0
+        exit_code, complaint = 0, ""
         try:
             with progress_bar(len(candidates), clock) as progress:
                 ranking = rank(
@@ -174,13 +175,18 @@ class Rank:
         except RankingInterrupted as interruption:
             ranking, reason = interruption.ranking, interruption.__cause__
             exit_code = 130 if isinstance(reason, KeyboardInterrupt) else 1
-            what = "interrupted" if exit_code == 130 else " ".join(str(reason).split()) or type(reason).__name__
-            print(f"jaxgrasp: {what}: ranked {len(ranking.margin):,} of {len(candidates):,}", file=sys.stderr)
+            what = signals.word() if exit_code == 130 else str(reason) or type(reason).__name__
+            complaint = f"{what}: ranked {len(ranking.margin):,} of {len(candidates):,}"
             if len(ranking.margin) == 0:
+                one_line(complaint)
                 return exit_code
         clock.lap()
         written, failed = self._write(ranking, unit, hand)
-        print_ranking(ranking, unit, clock, self._why_zero(ranking, disturbances), written)
+        zeros = self._why_zero(ranking, disturbances)
+        if complaint:
+            one_line(complaint)
+        with printing():
+            print_ranking(ranking, unit, clock, zeros, written)
         return exit_code or (2 if failed else 0)
 
     def _why_zero(self, ranking: "Ranking", disturbances: "DisturbanceSet") -> list[str]:

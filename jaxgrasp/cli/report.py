@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from jaxgrasp.cli import signals
 from jaxgrasp.ranking import MetricComparison, Ranking
 from jaxgrasp.solvers.status import Status
 
@@ -34,8 +35,9 @@ class Clock:
         self.ticks: list[tuple[float, int]] = []
 
     def tick(self, done: int) -> None:
-        """Notes that so many candidates are done."""
-        self.ticks.append((time.perf_counter(), done))
+        """Notes that so many candidates are done, once."""
+        if not self.ticks or done > self.ticks[-1][1]:
+            self.ticks.append((time.perf_counter(), done))
 
     def lap(self, what: str = "") -> None:
         """Ends the time so far; what was done since the last lap is told apart where it has a name."""
@@ -71,6 +73,7 @@ def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
         task = progress.add_task("compiling", total=total)
 
         def show(done: int) -> None:
+            signals.checkpoint()
             clock.tick(done)
             progress.update(task, completed=done, description="ranking" if done < total else "tightening")
 
@@ -111,6 +114,7 @@ def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
         task = progress.add_task("compiling", total=steps)
 
         def show(done: int, record: "Record") -> None:
+            signals.checkpoint()
             text = f"margin: median {record.median[-1]:z.3g}, best {record.best[-1]:z.3g}"
             progress.update(task, completed=done, description=text)
 
@@ -134,6 +138,7 @@ def hand_bar(starts: int, steps: int) -> Iterator[Callable[[int, int, dict[str, 
         task = progress.add_task("compiling", total=steps)
 
         def show(done: int, total: int, record: dict[str, np.ndarray]) -> None:
+            signals.checkpoint()
             middle = ", ".join(f"{name} {rows[-1, rows.shape[1] // 2]:.2f}" for name, rows in record.items())
             text = middle.replace("_", "-") if done < total else f"closing fingers and judging {starts:,} grasps"
             progress.update(task, completed=done, total=total, description=text)

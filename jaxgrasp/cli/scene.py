@@ -1,7 +1,6 @@
 """The options by which `jaxgrasp rank` takes a hand and an object from MJCF, and candidates from joint angles."""
 
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli.problems import CommandError, check_options
+from jaxgrasp.cli.streams import one_line
+from jaxgrasp.storage import FileError, read_archive, read_array
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -169,20 +170,17 @@ class Scene(HandScene):
         few = int((touching < self.min_contacts).sum())
         deep = int((found.columns["penetration"] > self.max_penetration).sum())
         if not left.all():
-            print(
-                f"jaxgrasp: left out {int((~left).sum()):,} of {len(qpos):,} configurations: {few:,} with fewer than "
-                f"{self.min_contacts} contacts, {deep:,} deeper than {1e3 * self.max_penetration:g} mm",
-                file=sys.stderr,
+            one_line(
+                f"left out {int((~left).sum()):,} of {len(qpos):,} configurations: {few:,} with fewer than "
+                f"{self.min_contacts} contacts, {deep:,} deeper than {1e3 * self.max_penetration:g} mm"
             )
         return found.take(np.flatnonzero(left))
 
     def _read(self, hand: "HandObject") -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        from jaxgrasp.candidates import CandidateError, read_archive, read_array
-
         assert self.qpos is not None
         try:
             columns = {"qpos": read_array(self.qpos)} if self.qpos.suffix == ".npy" else read_archive(self.qpos)
-        except CandidateError as error:
+        except FileError as error:
             raise CommandError(str(error)) from error
         qpos = columns.pop("qpos", None)
         wanted = f"(N, {hand.nq}), N configurations of the scene"

@@ -1,17 +1,43 @@
 """What the subcommands have in common: how JAX is set, and the disturbances by name."""
 
 import hashlib
+import math
 import os
 import platform
-import stat
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from jaxgrasp.cli.problems import CommandError
+from jaxgrasp.storage import cache_folder
 
 if TYPE_CHECKING:
     from jaxgrasp.disturbance import DisturbanceSet
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 BOX = (1.0, 1.0, 1.0, 0.02, 0.02, 0.02)
+# What tells processors apart in Linux, on x86 and on ARM: programs for one may end a process on another.
+_KINDS = {"vendor_id", "cpu family", "model", "model name", "flags"}
+_KINDS |= {"CPU implementer", "CPU variant", "CPU part", "Features"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What every subcommand that reads files can be told."""
+
+    read_limit: float = 2.0
+    """The most memory that one file that is read may ask for, GiB. What it declares is looked at before it is read."""
+
+    @property
+    def budget(self) -> int:
+        """The same in bytes.
+
+        Raises:
+            CommandError: It is no positive number.
+        """
+        if not 0.0 < self.read_limit < math.inf:
+            raise CommandError(f"--read-limit: got {self.read_limit}; wanted GiB > 0")
+        return int(self.read_limit * 2**30)
 
 
 def configure_jax() -> None:
@@ -31,21 +57,18 @@ def configure_jax() -> None:
 
 
 def _folder_of_programs() -> Path | None:
-    """Where JAX keeps what it has compiled, for this kind of processor; None where others could write it."""
+    """Where JAX keeps what it has compiled, for this kind of processor; None where nothing can be kept."""
     try:
-        processor = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags"))
-    except (OSError, StopIteration):
-        processor = platform.processor() or platform.machine()
-    kind = hashlib.sha256(processor.encode()).hexdigest()[:16]
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = base / "jaxgrasp" / "programs" / kind
+        # The first processor's; others of the same machine come after an empty line.
+        told = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+        processor = "\n".join(line for line in told if line.split("\t")[0].rstrip(" :") in _KINDS)
+    except OSError:
+        processor = ""
+    kind = hashlib.sha256(f"{platform.machine()} {platform.processor()} {processor}".encode()).hexdigest()[:16]
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        own = folder.stat()
+        return cache_folder("programs", kind)
     except OSError:
         return None
-    trusted = os.name != "posix" or (own.st_uid == os.getuid() and not own.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
-    return folder if trusted else None
 
 
 def named_disturbances(name: str) -> "tuple[DisturbanceSet, str]":

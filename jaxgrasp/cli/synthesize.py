@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from jaxgrasp.cli import signals
 from jaxgrasp.cli.problems import CommandError, check_options, check_output, write_files
-from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
+from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
+from jaxgrasp.cli.streams import one_line, printing
 from jaxgrasp.cli.synthesize_hand import SceneSynthesis
+from jaxgrasp.storage import atomic_write, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +25,7 @@ BUILT_IN = ("sphere", "ellipsoid", "box", "capsule", "cylinder", "superquadric")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synthesize:
+class Synthesize(Reading):
     """Make grasps of an object by gradient ascent on the largest disturbance that they resist.
 
     Contacts begin at random places on the surface and move along it. Writes an .npz file of candidates that `jaxgrasp
@@ -105,8 +108,12 @@ class Synthesize:
         from jaxgrasp.cli.report import print_synthesis
 
         written, failed = self._write(found, shape, name, unit)
-        print_synthesis(found, name, note, unit, self._why_zero(found, disturbances), written)
-        return 2 if failed else 0
+        zeros = self._why_zero(found, disturbances)
+        if found.interrupted:
+            one_line(f"{signals.word()}: grasps are those of fewer steps")
+        with printing():
+            print_synthesis(found, name, note, unit, zeros, written)
+        return 130 if found.interrupted else 2 if failed else 0
 
     def _check(self) -> None:
         span = math.inf if self.span is None else self.span
@@ -165,7 +172,7 @@ class Synthesize:
             f"{len(mesh.faces):,} triangles on a grid of {float(grid.spacing) * 1e3:.2f} mm; its surface is off theirs "
             f"by {np.median(off):.3f} mm in the median, {off.max():.2f} mm at most"
         )
-        return grid, mesh.centroid, path.stem, note
+        return grid, mesh.centroid, printable(path.stem), note
 
     def _synthesize(self, shape: "Shape", centre: "np.ndarray", disturbances: Any) -> "Synthesis":
         import jax
@@ -213,16 +220,17 @@ class Synthesize:
         surface = np.asarray(sample_surface(shape, jax.random.key(self.seed), 1500)) - found.center_of_mass
 
         def write_candidates(path: Path) -> None:
-            np.savez(
-                path,
-                positions=found.positions,
-                outward_normals=found.outward_normals,
-                friction=np.full(count, self.friction or _FRICTION),
-                max_force=np.full(count, self.max_force),
-                center_of_mass=np.broadcast_to(found.center_of_mass, (count, 3)),
-                object_name=np.full(count, name),
-                synthesis_margin=found.margin,
-            )
+            with atomic_write(path) as stream:
+                np.savez(
+                    stream,
+                    positions=found.positions,
+                    outward_normals=found.outward_normals,
+                    friction=np.full(count, self.friction or _FRICTION),
+                    max_force=np.full(count, self.max_force),
+                    center_of_mass=np.broadcast_to(found.center_of_mass, (count, 3)),
+                    object_name=np.full(count, name),
+                    synthesis_margin=found.margin,
+                )
 
         def write_picture(path: Path) -> None:
             write_figure(

@@ -1,7 +1,6 @@
 """`jaxgrasp synthesize --scene`: a hand and an object in, a file of configurations, a figure and pictures out."""
 
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxgrasp.cli import signals
 from jaxgrasp.cli.problems import CommandError, check_options, write_files
 from jaxgrasp.cli.scene import HandScene
+from jaxgrasp.cli.streams import one_line, printing
+from jaxgrasp.storage import atomic_write
 
 if TYPE_CHECKING:
     from jaxgrasp.disturbance import DisturbanceSet
@@ -107,9 +109,10 @@ class SceneSynthesis(HandScene):
             raise CommandError(f"--scene {self.scene}: {error}") from error
         kept = np.flatnonzero(found.good) if self.keep is None else found.diverse(self.keep, self.diversity)
         written, failed = self._write(hand, found, found.take(kept), unit, output, figure)
-        print_hand_synthesis(found, len(kept), self._name, unit, written)
         if found.interrupted:
-            print("jaxgrasp: interrupted: grasps are those of fewer steps or starts", file=sys.stderr)
+            one_line(f"{signals.word()}: grasps are those of fewer steps or starts")
+        with printing():
+            print_hand_synthesis(found, len(kept), self._name, unit, written)
         return 130 if found.interrupted else 2 if failed else 0
 
     @property
@@ -128,15 +131,16 @@ class SceneSynthesis(HandScene):
         from jaxgrasp.viewer import figure_of_hand_synthesis, write_figure
 
         def write_candidates(path: Path) -> None:
-            np.savez(
-                path,
-                qpos=kept.qpos,
-                pregrasp_qpos=kept.pregrasp,
-                squeeze_qpos=kept.squeeze,
-                squeeze_controls=kept.controls,
-                synthesis_margin=kept.margin,
-                self_penetration=kept.self_penetration,
-            )
+            with atomic_write(path) as stream:
+                np.savez(
+                    stream,
+                    qpos=kept.qpos,
+                    pregrasp_qpos=kept.pregrasp,
+                    squeeze_qpos=kept.squeeze,
+                    squeeze_controls=kept.controls,
+                    synthesis_margin=kept.margin,
+                    self_penetration=kept.self_penetration,
+                )
 
         def write_picture(path: Path) -> None:
             write_figure(figure_of_hand_synthesis(found, name=self._name, unit=unit), path)
@@ -145,7 +149,7 @@ class SceneSynthesis(HandScene):
         if len(kept.qpos):
             jobs.insert(0, (output, write_candidates))
         else:
-            print(f"jaxgrasp: {output}: not written, no grasp is good", file=sys.stderr)
+            one_line(f"{output}: not written, no grasp is good")
         written, failed = write_files(*jobs)
         if len(kept.qpos):
             # Many machines have nothing to render with: that is told, and no failure.

@@ -1,5 +1,7 @@
 """Triangle meshes from files, and the grids of their signed distances."""
 
+import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,14 +10,15 @@ from jaxtyping import Float, Int
 
 from jaxgrasp.geometry.grid import DistanceGrid
 from jaxgrasp.geometry.triangles import signed_distances
+from jaxgrasp.storage import FileError, open_regular
 
 MESH_ENDINGS = (".stl", ".obj", ".ply")
 # Nodes beyond the mesh on every side: the spline's support, and room for points on their way back to the surface.
 _MARGIN = 4
 # Nodes nearer to the surface than 1.5 sqrt(3) spacings take part in look-ups on it; the rest is for those beside it.
 _BAND = 3.5
-# What trimesh's readers raise for damaged files; for noise in place of text, that a guesser of encodings is missing.
-_BROKEN = (ValueError, TypeError, LookupError, AttributeError, EOFError, OSError, MemoryError, ImportError)
+# Bytes of memory that a byte of a mesh file takes, of text above all.
+_COST = 10
 
 
 class MeshError(ValueError):
@@ -74,15 +77,24 @@ class Mesh:
         # Two seconds that those who need no files do not wait for.
         import trimesh
 
+        kind = path.suffix[1:].lower()
         try:
-            with path.open("rb") as stream:
-                found = trimesh.load_mesh(stream, file_type=path.suffix[1:].lower(), process=True)
-            return cls.from_arrays(scale * np.asarray(found.vertices), np.asarray(found.faces))
+            with open_regular(path, "an intact mesh", cost=_COST) as stream:
+                content = stream.read()
+            if kind == "ply":
+                _check_counts(content)
+            # Without a name there are no neighbours, of which the file could make us read others.
+            found = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=True, skip_materials=True)
+            vertices, faces = scale * np.asarray(found.vertices), np.asarray(found.faces)
+        except FileError as error:
+            raise MeshError(str(error)) from error
+        except Exception as error:
+            # For damaged files trimesh raises whatever its parsers run into.
+            raise MeshError(f"{path}: got damaged data ({type(error).__name__}), wanted an intact mesh") from error
+        try:
+            return cls.from_arrays(vertices, faces)
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
-        except _BROKEN as error:
-            reason = error.strerror.lower() if isinstance(error, OSError) and error.strerror else "damaged data"
-            raise MeshError(f"{path}: got {reason}, wanted an intact mesh") from error
 
     @property
     def triangles(self) -> Float[np.ndarray, "triangles 3 3"]:
@@ -154,6 +166,13 @@ class Mesh:
         corners = self.triangles - amid
         volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
         return volumes, corners.sum(1) / 4 + amid
+
+
+def _check_counts(content: bytes) -> None:
+    """Refuses a PLY file that declares more elements than it has bytes, before they are allocated."""
+    declared = re.findall(rb"^element\s+\S+\s+(\d+)", content.split(b"end_header", 1)[0], re.MULTILINE)
+    if sum(int(count[:20]) for count in declared) > len(content):
+        raise ValueError("more elements than bytes")
 
 
 def _spacing(extents: np.ndarray, nodes: int) -> float:

@@ -5,20 +5,34 @@ from os import PathLike
 import mujoco
 import numpy as np
 
+from jaxgrasp.hands.files import compile_file
+
 
 def read_model(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
     """The model of a file or a specification.
 
     Raises:
-        ValueError: It cannot be read.
+        ValueError: It cannot be read, or has numbers that are not finite.
     """
-    if isinstance(scene, mujoco.MjModel):
-        return scene
     try:
-        return scene.compile() if isinstance(scene, mujoco.MjSpec) else mujoco.MjModel.from_xml_path(str(scene))
+        if isinstance(scene, mujoco.MjSpec):
+            model = scene.compile()
+        else:
+            model = scene if isinstance(scene, mujoco.MjModel) else compile_file(scene)
     except ValueError as error:
         name = "the specification" if isinstance(scene, mujoco.MjSpec) else scene
         raise ValueError(f"scene: {name} cannot be read: {' '.join(str(error).split())}") from error
+    _refuse_infinite(model)
+    return model
+
+
+def _refuse_infinite(model: mujoco.MjModel) -> None:
+    """MuJoCo reads "nan" as a number."""
+    arrays = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
+    numbers = {n: x for n, x in arrays.items() if isinstance(x, np.ndarray) and x.dtype.kind == "f"}
+    bad = [name for name, values in numbers.items() if not np.isfinite(values).all()]
+    if bad:
+        raise ValueError(f"scene: got {', '.join(bad)} with entries that are not finite; wanted numbers")
 
 
 def body_named(model: mujoco.MjModel, argument: str, name: str) -> int:

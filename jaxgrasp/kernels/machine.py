@@ -5,11 +5,10 @@ import ctypes
 import functools
 import hashlib
 import os
-import stat
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
+
+from jaxgrasp.storage import FileError, atomic_write, cache_folder, open_regular
 
 SETTING = "JAXGRASP_VECTOR_BITS"
 # What narrower vectors than the processor's are made without.
@@ -151,12 +150,9 @@ def capsule(address: int) -> Any:
 def cached(key: str) -> bytes | None:
     """What was kept, if it is whole; what others could have written is not trusted."""
     try:
-        folder = _folder()
-        own = folder.stat()
-        if own.st_uid != os.getuid() or own.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-            return None
-        content = (folder / key).read_bytes()
-    except OSError:
+        with open_regular(cache_folder("kernels") / key) as stream:
+            content = stream.read()
+    except (OSError, FileError):
         return None
     digest, rest = content[:32], content[32:]
     return rest if hashlib.sha256(rest).digest() == digest else None
@@ -166,15 +162,7 @@ def keep(key: str, content: bytes) -> None:
     """Keep object code, or what is known of a program.
 
     Raises:
-        OSError: the folder cannot be written.
+        OSError: the folder cannot be written, or others could write to it.
     """
-    folder = _folder()
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+    with atomic_write(cache_folder("kernels") / key) as file:
         file.write(hashlib.sha256(content).digest() + content)
-    os.replace(file.name, folder / key)
-
-
-def _folder() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "jaxgrasp" / "kernels"

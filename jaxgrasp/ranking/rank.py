@@ -74,7 +74,7 @@ class RankingInterrupted(Exception):
         """Keeps what was ranked before.
 
         Args:
-            ranking: The candidates that were reached, without tightening forces.
+            ranking: The candidates that were reached, with those tightening forces that were found.
         """
         super().__init__(f"the ranking was cut short after {len(ranking.margin)} candidates")
         self.ranking = ranking
@@ -108,7 +108,7 @@ def rank(
             PRUNED; the `top` themselves are the same. Not together with `metrics`.
         metrics: Of all candidates, from `score`; where there are any, the first ranks in place of the margin.
         tile: Candidates at a time, at most; None chooses by platform.
-        progress: Called after each tile of (21) with the number of candidates done.
+        progress: Called after each tile of (21), and then of (22), with the number of candidates done by (21).
 
     Returns:
         The ranking.
@@ -135,6 +135,7 @@ def rank(
     if prune:
         columns["cutoff"] = np.full(len(candidates), -np.inf)
     settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": tile}
+    answers = []
     try:
         for rows, answer in solve_in_tiles(margins, columns, disturbances, **settings):
             scores.fill(rows, *answer)
@@ -146,9 +147,12 @@ def rank(
         order = scores.order()
         best = order[:top]
         columns = {name: column[best] for name, column in columns.items()} | {"wanted": share * scores.bearable(best)}
-        answers = [answer for _, answer in solve_in_tiles(tightening, columns, disturbances, **settings)]
+        for _, answer in solve_in_tiles(tightening, columns, disturbances, **settings):
+            answers.append(answer)
+            if progress is not None:
+                progress(scores.done)
     except (KeyboardInterrupt, RuntimeError, MemoryError) as reason:
-        raise RankingInterrupted(scores.ranking(candidates, scores.order(), share, [])) from reason
+        raise RankingInterrupted(scores.ranking(candidates, scores.order(), share, answers)) from reason
     return scores.ranking(candidates, order, share, answers)
 
 

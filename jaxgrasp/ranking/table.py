@@ -12,6 +12,7 @@ from pyarrow import csv, parquet
 
 from jaxgrasp.ranking.rank import Ranking
 from jaxgrasp.solvers.status import Status
+from jaxgrasp.storage import atomic_write
 
 _PIECE = 131_072
 
@@ -90,13 +91,8 @@ def write_table(ranking: Ranking, path: Path | str) -> None:
     path = Path(path)
     if path.suffix not in TABLE_ENDINGS:
         raise ValueError(f"path: got the ending {path.suffix!r}; wanted one of {', '.join(TABLE_ENDINGS)}")
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as stream:
-            _WRITERS[path.suffix](ranking, stream)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with atomic_write(path) as stream:
+        _WRITERS[path.suffix](ranking, stream)
 
 
 def _write_parquet(ranking: Ranking, stream: BinaryIO) -> None:

@@ -61,6 +61,8 @@ class Synthesis:
     """In the frame of the shape, m: add it to the positions to come back to it."""
     record: Record
     """How the ascent went."""
+    interrupted: bool
+    """Whether Ctrl-C ended the ascent early."""
 
 
 def synthesize(
@@ -104,7 +106,8 @@ def synthesize(
         progress: called with the number of steps done and the record so far.
 
     Returns:
-        A grasp for each start, the best first.
+        A grasp for each start, the best first. Ctrl-C ends the ascent early: after the first steps, what there is
+        is evaluated and returned.
 
     Raises:
         ValueError: numbers out of range, with the argument's name.
@@ -168,6 +171,7 @@ def synthesize(
         restarts=np.asarray(state.restarts)[order],
         center_of_mass=np.asarray(centre),
         record=record,
+        interrupted=len(record.median) < steps,
     )
 
 
@@ -181,21 +185,26 @@ def _ascend(
     progress: Callable[[int, Record], None] | None,
 ) -> tuple[State, Record]:
     state, rows = jax.device_put(State.from_starts(begin), begin.sharding), []
-    for first in range(0, steps, CHUNK):
-        state, margins = advance(state, task, jnp.asarray(first), key, min(cone_edges, MOST_EDGES), mesh)
-        margins = np.sort(np.asarray(margins), axis=1)
-        count = margins.shape[1]
-        rows.append(
-            np.stack(
-                [margins[:, count // 10], margins[:, count // 2], margins[:, -1], (margins > 1e-4).mean(1)], axis=1
-            )
-        )
-        record = Record(
-            **dict(zip(("lowest_tenth", "median", "best", "positive"), np.concatenate(rows).T, strict=True))
-        )
-        if progress is not None:
-            progress(min(first + CHUNK, steps), record)
-    return state, record
+    try:
+        for first in range(0, steps, CHUNK):
+            state, margins = advance(state, task, jnp.asarray(first), key, min(cone_edges, MOST_EDGES), mesh)
+            rows.append(_quantiles(np.sort(np.asarray(margins), axis=1)))
+            if progress is not None:
+                progress(min(first + CHUNK, steps), _record(rows))
+    except KeyboardInterrupt:
+        if not rows:
+            raise
+    return state, _record(rows)
+
+
+def _quantiles(margins: np.ndarray) -> np.ndarray:
+    """What `Record` has of sorted margins, a row a step."""
+    count = margins.shape[1]
+    return np.stack([margins[:, count // 10], margins[:, count // 2], margins[:, -1], (margins > 1e-4).mean(1)], axis=1)
+
+
+def _record(rows: list[np.ndarray]) -> Record:
+    return Record(**dict(zip(("lowest_tenth", "median", "best", "positive"), np.concatenate(rows).T, strict=True)))
 
 
 def _in(dtype: jnp.dtype, tree: T) -> T:

@@ -9,6 +9,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
 from jaxgrasp.simulation import Run
+from jaxgrasp.storage import atomic_write
 from jaxgrasp.viewer.offscreen import offscreen
 from jaxgrasp.viewer.scene import add_arrow, add_background, for_pictures
 
@@ -55,7 +56,9 @@ def write_movie(
         for step in steps:
             panels = [_panel(model, data, render, run, lane, step, centre) for _, run, lane in runs]
             frames.append(_labelled(panels, [title for title, _, _ in runs], time[step]))
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=round(1e3 * _FRAME), loop=0, optimize=True)
+    options = {"save_all": True, "duration": round(1e3 * _FRAME), "loop": 0, "optimize": True}
+    with atomic_write(path) as stream:
+        frames[0].save(stream, format="GIF", append_images=frames[1:], **options)
 
 
 def _panel(

@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 
 from jaxgrasp.ranking import Ranking
 from jaxgrasp.solvers.status import Status
+from jaxgrasp.storage import atomic_write
 from jaxgrasp.viewer.grasp import CONTACT_COLOURS, draw_grasp
 
 # A margin below this, in multiples of the disturbance set, is drawn as none: the solver's own tolerance.
@@ -64,12 +65,8 @@ def write_figure(figure: Figure, path: Path | str) -> None:
         OSError: The file cannot be written.
     """
     path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        figure.savefig(part, format=path.suffix.removeprefix("."))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with atomic_write(path) as stream:
+        figure.savefig(stream, format=path.suffix.removeprefix("."))
 
 
 def _draw_distribution(axes: np.ndarray, ranking: Ranking, unit: str) -> None:

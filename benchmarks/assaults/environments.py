@@ -1,0 +1,135 @@
+"""Every command where it finds less than it is used to: it works, or says why not in one line.
+
+Python's own files have to be readable for whoever it runs as; as root, `nobody` is given the capability to read.
+
+    python -m benchmarks.assaults.environments [--output environments.md]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+COMMANDS = {
+    "rank": ["rank", "grasps.npz"],
+    "rank --scene": ["rank", "--scene", "four_fingers", "--samples", "50", "--picture", "None", "--figure", "None"],
+    "synthesize": ["synthesize", "--starts", "16", "--steps", "10", "--figure", "None"],
+    "compare": ["compare", "grasps.npz", "--metric", "margin,min_weight"],
+    "--help": ["--help"],
+}
+
+
+@dataclass(frozen=True)
+class Environment:
+    name: str
+    variables: dict[str, str | None] = field(default_factory=dict)
+    """What is set, or, where None, is not there."""
+    shell: str = "exec "
+    """Before the command."""
+    after: str = " > out"
+
+
+def environments(root: Path) -> list[Environment]:
+    read_only = root / "read_only"
+    read_only.mkdir(mode=0o555)
+    # Root writes where nobody may: for root, as for others, a file in place of the folder is what cannot be written to.
+    (root / "no_folder").write_text("")
+    no_home = {"HOME": None, "XDG_CACHE_HOME": None}
+    without = "--clear-groups --inh-caps=-all,+dac_read_search --ambient-caps=-all,+dac_read_search"
+    someone = f"exec setpriv --reuid 54321 --regid 54321 {without} "
+    nobody = f"exec setpriv --reuid 65534 --regid 65534 {without} "
+    found = [
+        Environment("as it is"),
+        Environment("LANG=C", {"LANG": "C", "LC_ALL": "C"}),
+        Environment("PYTHONIOENCODING=ascii", {"PYTHONIOENCODING": "ascii"}),
+        Environment("PYTHONUTF8=0 in latin-1", {"PYTHONUTF8": "0", "PYTHONIOENCODING": "latin-1"}),
+        Environment("HOME that is a file", {"HOME": str(root / "no_folder"), "XDG_CACHE_HOME": None}),
+        Environment("standard output closed", after=" >&-"),
+        Environment("all streams closed", after=" <&- >&- 2>&-"),
+        Environment("standard output on a full disk", after=" > /dev/full"),
+        Environment("into head", shell="", after=" | head -n 1 > out; exit ${PIPESTATUS[0]}"),
+    ]
+    if os.getuid() == 0 and shutil.which("setpriv"):
+        found += [
+            Environment("no HOME, no passwd entry", no_home, someone),
+            Environment("read-only HOME", {"HOME": str(read_only), "XDG_CACHE_HOME": None}, someone),
+            Environment("read-only XDG_CACHE_HOME", {"XDG_CACHE_HOME": str(read_only)}, someone),
+            Environment("nobody", {"HOME": "/nonexistent", "XDG_CACHE_HOME": None}, nobody),
+        ]
+    return found
+
+
+def outcome(arguments: list[str], given: Environment, home: Path) -> str:
+    variables = {**os.environ, **{k: v for k, v in given.variables.items() if v is not None}}
+    for name, value in given.variables.items():
+        if value is None:
+            variables.pop(name, None)
+    command = " ".join([f"{sys.executable} -m jaxgrasp.cli", *arguments])
+    process = subprocess.run(
+        ["bash", "-c", f"{given.shell}{command}{given.after}"],
+        cwd=home,
+        env=variables,
+        capture_output=True,
+        timeout=600,
+    )
+    said = process.stderr.decode("utf-8", "replace")
+    if process.returncode in (0, 2) and said.count("\n") <= 1 and (not said or said.startswith("jaxgrasp: ")):
+        if process.returncode == 2 and not said and ">&-" not in given.after:
+            return "**silent exit 2**"
+        return {0: "works", 2: "one line, exit 2"}[process.returncode] + (
+            ", one line" if said and not process.returncode else ""
+        )
+    print(given.name, arguments, process.returncode, said[-2000:], file=sys.stderr, flush=True)
+    return f"**exit {process.returncode}, {said.count(chr(10))} lines**"
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--output", type=Path)
+    options.add_argument("--only", help="environments with this in their name alone")
+    output = options.parse_args()
+    lines = [f"| | {' | '.join(f'`{name}`' for name in COMMANDS)} |", "|---|" + "---|" * len(COMMANDS)]
+    with tempfile.TemporaryDirectory() as name:
+        root, home = Path(name), Path(name, "home")
+        root.chmod(0o755)
+        home.mkdir()
+        home.chmod(0o777)
+        from jaxgrasp.candidates import sample_grasps
+
+        grasps = sample_grasps(50)
+        np.savez(
+            home / "grasps.npz",
+            positions=grasps.positions,
+            outward_normals=grasps.normals,
+            friction=grasps.friction,
+            max_force=grasps.max_force,
+            object_name=np.full(50, "größe 猫 $x_\\{"),
+        )
+        (home / "grasps.npz").chmod(0o644)
+        for given in environments(root):
+            if (output.only or "") not in given.name:
+                continue
+            cells = []
+            for arguments in COMMANDS.values():
+                for path in home.iterdir():
+                    if path.name != "grasps.npz":
+                        path.unlink()
+                (home / "out").touch()
+                (home / "out").chmod(0o666)
+                cells.append(outcome(arguments, given, home))
+            lines.append(f"| {given.name} | {' | '.join(cells)} |")
+            print(lines[-1], flush=True)
+    if output.output:
+        output.output.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Malformed inputs by kind: each a file that `jaxgrasp` is given."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.assaults.arrays import archives, arrays
+from benchmarks.assaults.models import models
+from benchmarks.assaults.shapes import obj, ply, stl
+
+
+@dataclass(frozen=True)
+class Case:
+    kind: str
+    """npz, npy, stl, obj, ply or xml."""
+    name: str
+    path: Path
+
+
+def cases(folder: Path, only: str | None = None, seed: int = 0) -> list[Case]:
+    """Writes all of them, or those of one kind, into a folder."""
+    found = []
+    for kind, make in (
+        ("npz", archives), ("npy", arrays), ("stl", stl), ("obj", obj), ("ply", ply), ("xml", models)
+    ):  # fmt: skip
+        if only not in (None, kind):
+            continue
+        home = folder / kind
+        home.mkdir(parents=True)
+        names = os.fspath(home)
+        for name, content in make(random.Random(seed), home):
+            path = Path(names, f"{len(found):04d}_{name}.{kind}")
+            if isinstance(content, bytes):
+                path.write_bytes(content)
+            else:
+                content(path)
+            found.append(Case(kind, name, path))
+        for name, content in special(home):
+            path = home / f"{len(found):04d}_{name}.{kind}"
+            content(path)
+            found.append(Case(kind, name, path))
+    return found
+
+
+def special(home: Path) -> Iterator[tuple[str, Any]]:
+    """Files that are none, and text that no encoding takes."""
+    yield "fifo", os.mkfifo
+    yield "folder", os.mkdir
+    yield "loop", lambda path: path.symlink_to(path)
+    yield "dangling", lambda path: path.symlink_to(home / "nothing")
+    for device in ("zero", "null", "urandom", "full"):
+        yield f"dev_{device}", lambda path, device=device: path.symlink_to(f"/dev/{device}")
+    yield "memory", lambda path: path.symlink_to("/proc/self/mem")
+    yield "sparse_20G", lambda path: os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 20 << 30)
+    yield "absent", lambda path: None
+    for label in ("line\nend", "\x1b[31mred", "[red]x", "$x$", "%s%n", "größe 猫", "\udcff\udcfe"):
+        yield f"named_{label}", lambda path: path.write_bytes(b"broken")
+    yield "empty", lambda path: path.write_bytes(b"")
+    yield "noise", lambda path: path.write_bytes(random.Random(1).randbytes(5000))
+    yield "text", lambda path: path.write_bytes(b"hello\n" * 100)
+    yield "zeros", lambda path: path.write_bytes(bytes(100_000))

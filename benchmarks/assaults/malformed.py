@@ -1,0 +1,224 @@
+"""What `jaxgrasp` does with malformed inputs: one line and exit 2, or the right meaning, in little time and memory.
+
+Every input is given to the command's `main` in a process of its own, forked from one that has imported everything, so
+that a thousand of them take minutes; `--sample N` runs every Nth as a command from its very start. An accepted mesh or
+model is read and checked as the command does, and then the computation is left out. What is accepted from an archive
+or an array is held against NumPy's own reader. Seconds are the processor's, so that busy machines tell the same;
+what takes a minute on the clock is killed.
+
+    python -m benchmarks.assaults.malformed [--sample 40] [--kind npz] [--output malformed.md]
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.assaults.arrays import grasps
+from benchmarks.assaults.inputs import Case, cases
+
+SECONDS, MEBIBYTES, KILLED_AFTER = 10.0, 600.0, 60.0
+RANK = ["--output", "table.csv", "--figure", "None", "--top", "2"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    case: Case
+    code: int
+    """Negative for a signal."""
+    errors: str
+    seconds: float
+    """Of the processor, its children included."""
+    mebibytes: float
+    accepted_wrongly: str
+
+    @property
+    def faults(self) -> list[str]:
+        found = []
+        if self.code == 2 and (self.errors.count("\n") != 1 or not self.errors.startswith("jaxgrasp: ")):
+            found.append("not one line")
+        if self.code == 0 and self.errors:
+            found.append("said something")
+        if self.code not in (0, 2):
+            found.append(f"exit {self.code}")
+        if self.seconds > SECONDS:
+            found.append("slow")
+        if self.mebibytes > MEBIBYTES:
+            found.append("large")
+        if self.accepted_wrongly:
+            found.append(self.accepted_wrongly)
+        return found
+
+
+def arguments(case: Case, good: Path) -> list[str]:
+    path = os.fspath(case.path)
+    if case.kind == "npz":
+        return ["rank", path, *RANK]
+    if case.kind == "npy":
+        return ["rank", os.fspath(good), "--disturbances", path, *RANK]
+    if case.kind == "xml":
+        return ["rank", "--scene", path, *RANK, "--picture", "None"]
+    return ["synthesize", "--object", path, "--figure", "None", "--output", "table.npz"]
+
+
+def forked(case: Case, good: Path, home: Path) -> Outcome:
+    """Runs one in a child of this process."""
+    begun = time.perf_counter()
+    child = os.fork()
+    if child == 0:
+        code = 70
+        try:
+            os.chdir(home)
+            for number, name in ((1, "out"), (2, "err")):
+                os.dup2(os.open(home / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
+            sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
+            _leave_out_computation()
+            from jaxgrasp.cli import main
+
+            code = main(arguments(case, good))
+        except SystemExit as leaving:
+            code = leaving.code if isinstance(leaving.code, int) else 70
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stderr.flush()
+            os._exit(code)
+    code, usage = _wait(child, begun)
+    errors = (home / "err").read_text("utf-8", "replace")
+    wrong = _wrongly_accepted(case) if code == 0 else ""
+    return Outcome(case, code, errors, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, wrong)
+
+
+def commanded(case: Case, good: Path, home: Path) -> Outcome:
+    """Runs one as a command, whose time and memory include the start of Python and of JAX."""
+    begun = time.perf_counter()
+    command = [sys.executable, "-m", "jaxgrasp.cli", *arguments(case, good)]
+    if case.kind not in ("npz", "npy"):
+        command += ["--samples", "8"] if case.kind == "xml" else ["--starts", "8", "--steps", "10"]
+    with open(home / "err", "w") as errors:
+        process = subprocess.Popen(command, cwd=home, stdout=subprocess.DEVNULL, stderr=errors)
+        code, usage = _wait(process.pid, begun)
+        process.returncode = code
+    text = (home / "err").read_text("utf-8", "replace")
+    return Outcome(case, code, text, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, "")
+
+
+def _wait(child: int, begun: float) -> tuple[int, resource.struct_rusage]:
+    while True:
+        found, status, usage = os.wait4(child, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status), usage
+        if time.perf_counter() - begun > KILLED_AFTER:
+            os.kill(child, signal.SIGKILL)
+        time.sleep(0.005)
+
+
+def _leave_out_computation() -> None:
+    """Ends the process where a mesh or a model has been accepted."""
+    import jaxgrasp.cli.scene
+    import jaxgrasp.geometry
+
+    def accept(*_: Any, **__: Any) -> None:
+        sys.stderr.flush()
+        os._exit(0)
+
+    jaxgrasp.geometry.sample_surface = accept
+    jaxgrasp.cli.scene.Scene.candidates = accept
+
+
+def _wrongly_accepted(case: Case) -> str:
+    """What differs from NumPy's reader, in what was accepted."""
+    from jaxgrasp.candidates import read_candidates, read_wrenches
+
+    try:
+        if case.kind == "npy":
+            theirs = np.load(case.path, allow_pickle=False)
+            theirs, ours = (theirs["wrenches"] if hasattr(theirs, "files") else theirs), read_wrenches(case.path)
+            return "" if np.array_equal(theirs.astype(float), ours) else "other wrenches than NumPy"
+        if case.kind == "npz":
+            ours = read_candidates([case.path], friction=0.6, max_force=10.0)
+            with np.load(case.path, allow_pickle=False) as theirs:
+                same = np.array_equal(theirs["positions"].astype(float), ours.positions, equal_nan=True)
+                for name, column in ours.columns.items():
+                    if column.dtype.kind in "iuf":
+                        same &= np.array_equal(theirs[name].astype(float), column.astype(float), equal_nan=True)
+            return "" if same else "other columns than NumPy"
+    except Exception as error:
+        return f"accepted what NumPy refuses ({type(error).__name__})"
+    return ""
+
+
+def table(found: list[Outcome], title: str) -> str:
+    lines = [
+        f"## {title}",
+        "",
+        "| kind | tried | refused, one line | accepted | otherwise | slowest, s | largest, MiB |",
+    ]
+    lines.append("|---|---:|---:|---:|---:|---:|---:|")
+    kinds = collections.defaultdict(list)
+    for outcome in found:
+        kinds[outcome.case.kind].append(outcome)
+    for kind, rows in [*kinds.items(), ("all", found)]:
+        refused = sum(row.code == 2 and not row.faults for row in rows)
+        accepted = sum(row.code == 0 and not row.faults for row in rows)
+        slowest, largest = max(row.seconds for row in rows), max(row.mebibytes for row in rows)
+        cells = [len(rows), refused, accepted, len(rows) - refused - accepted, f"{slowest:.1f}", f"{largest:.0f}"]
+        lines.append(f"| {kind} | {' | '.join(map(str, cells))} |")
+    lines += [""] + [f"- {r.case.kind} {r.case.name[:60]!r}: {', '.join(r.faults)}" for r in found if r.faults]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--sample", type=int, default=40, help="every how manieth is run as a command; 0 for none")
+    options.add_argument("--kind", help="of one kind alone")
+    options.add_argument("--name", help="of names with this in them alone")
+    options.add_argument("--every", type=int, default=1, help="every how manieth is tried at all")
+    options.add_argument("--output", type=Path)
+    options.add_argument("--verbose", action="store_true", help="print every outcome")
+    given = options.parse_args()
+    import jaxgrasp.cli.subcommands
+    import jaxgrasp.geometry
+    import jaxgrasp.hands.scenes
+    import jaxgrasp.ranking
+    import jaxgrasp.viewer  # noqa: F401
+
+    with tempfile.TemporaryDirectory() as folder:
+        good, home = Path(folder, "good.npz"), Path(folder, "home")
+        home.mkdir()
+        np.savez(good, **grasps())
+        tried = cases(Path(folder, "inputs"), given.kind)[:: given.every]
+        tried = [c for c in tried if (given.name or "") in c.name]
+        # The first one compiles the kernels.
+        forked(Case("npz", "warm", good), good, home)
+        found = []
+        for case in tried:
+            found.append(forked(case, good, home))
+            if given.verbose or found[-1].faults:
+                print(case.kind, repr(case.name[:60]), found[-1].code, f"{found[-1].seconds:.1f} s", end=" ")
+                print(f"{found[-1].mebibytes:.0f} MiB", found[-1].faults, found[-1].errors[-300:].strip(), flush=True)
+        text = table(found, "In forked processes")
+        if given.sample:
+            text += "\n" + table([commanded(c, good, home) for c in tried[:: given.sample]], "As commands")
+        left = sorted(path.name for path in home.iterdir())
+        text += f"\nFiles left in the working folder: {', '.join(left)}.\n"
+    print(text)
+    if given.output:
+        given.output.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,5 @@
+"""`python -m jaxgrasp.cli`."""
+
+from jaxgrasp.cli import program
+
+program()

@@ -1,0 +1,283 @@
+"""NumPy's files: what they declare is checked against the budget before anything is inflated or allocated.
+
+A header says how large its array is in a few bytes, and a few kilobytes of archive inflate to gigabytes. Headers are
+therefore read first, members that nobody asks for are never inflated, and objects are never unpickled.
+"""
+
+import contextlib
+import io
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NoReturn
+
+import numpy as np
+
+from jaxgrasp.storage.reading import FileError, allowance, in_bytes, open_regular, reason_of
+
+# What zipfile and zlib raise for damaged, encrypted or oddly compressed members.
+_BROKEN = (ValueError, KeyError, IndexError, EOFError, OSError, RuntimeError, MemoryError, OverflowError)
+_BROKEN += (zipfile.BadZipFile, zlib.error, struct.error)
+_MAGIC = b"\x93NUMPY"
+# NumPy's own parser takes headers of up to 10,000 characters.
+_HEADER = 10_240
+_DIMENSIONS = 32
+_CHUNK = 1 << 18
+_MEMBERS, _DIRECTORY = 10_000, 4 << 20
+# Archives of zeros shrink a thousandfold; grasps, hardly at all. Small members, such as a constant column of a million
+# candidates, may shrink as they like.
+_INFLATION, _SMALL = 100, 256 << 20
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an array's file says before its data."""
+
+    shape: tuple[int, ...]
+    """Of the array."""
+    dtype: np.dtype
+    """Of its entries."""
+    fortran_order: bool
+    """Whether the first axis is the one whose entries lie beside each other."""
+    offset: int
+    """Where the data begin, bytes."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the data."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def cost(self) -> int:
+        """Bytes that the array takes in memory as eight-byte numbers, or as text where it is bytes."""
+        wide = 4 if self.dtype.kind == "S" else 1
+        return math.prod(self.shape) * max(8, wide * self.dtype.itemsize)
+
+
+class Archive:
+    """An open `.npz` file, see `open_archive`."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile):
+        """Reads the headers of all members, and none of their data."""
+        self._path, self._archive = path, archive
+        self.headers: dict[str, Header] = {}
+        """What each array declares, by name, in the file's order."""
+        self._members: dict[str, zipfile.ZipInfo] = {}
+        members = archive.infolist()
+        if len(members) > _MEMBERS:
+            raise FileError(path, None, f"{len(members):,} members", f"at most {_MEMBERS:,}")
+        for member in members:
+            name = member.filename.removesuffix(".npy")
+            if name in self.headers:
+                raise FileError(path, name, "two arrays of this name", "one")
+            self.headers[name], self._members[name] = self._header(name, member), member
+
+    def read(self, names: Iterable[str]) -> dict[str, np.ndarray]:
+        """Reads some of the arrays.
+
+        Args:
+            names: Of `headers`.
+
+        Raises:
+            FileError: One of them is damaged, or has Python objects, or they are too large together.
+        """
+        names = tuple(names)
+        for name in names:
+            _refuse_objects(self._path, name, self.headers[name].dtype)
+        self._check_cost(names)
+        return {name: self._read(name) for name in names}
+
+    def _check_cost(self, names: tuple[str, ...]) -> None:
+        headers, members = ([table[name] for name in names] for table in (self.headers, self._members))
+        largest = max(names, key=lambda name: self.headers[name].cost, default=None)
+        _check_cost(self._path, largest, sum(header.cost for header in headers))
+        inflated, stored = (sum(getattr(m, which) for m in members) for which in ("file_size", "compress_size"))
+        if inflated > max(_SMALL, _INFLATION * stored):
+            got = f"{in_bytes(stored)} that inflate to {in_bytes(inflated)}"
+            raise FileError(self._path, largest, got, f"at most {_INFLATION} times as much (numpy.savez does so)")
+
+    def _header(self, name: str, member: zipfile.ZipInfo) -> Header:
+        try:
+            with self._open(name, member) as stream:
+                start = stream.read(_HEADER)
+        except _BROKEN as error:
+            _damaged(self._path, name, error)
+        if not start.startswith(_MAGIC):
+            raise FileError(self._path, name, "a member that is no array", "arrays only")
+        header = _parsed(self._path, name, start)
+        if member.file_size != header.offset + header.size and not header.dtype.hasobject:
+            declared = f"{in_bytes(member.file_size)} where the header declares {in_bytes(header.offset + header.size)}"
+            raise FileError(self._path, name, f"damaged data ({declared})", "an intact .npz file")
+        return header
+
+    def _read(self, name: str) -> np.ndarray:
+        header, data = self.headers[name], np.empty(self.headers[name].size, np.uint8)
+        try:
+            with self._open(name, self._members[name]) as stream:
+                stream.read(header.offset)
+                for start in range(0, len(data), _CHUNK):
+                    part = stream.read(min(_CHUNK, len(data) - start))
+                    data[start : start + len(part)] = np.frombuffer(part, np.uint8)
+                    if len(part) < min(_CHUNK, len(data) - start):
+                        raise EOFError("it ends early")
+                # At the end zipfile compares the checksum.
+                stream.read(1)
+        except _BROKEN as error:
+            _damaged(self._path, name, error)
+        return _array(self._path, name, header, data)
+
+    def _open(self, name: str, member: zipfile.ZipInfo) -> Any:
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise FileError(self._path, name, "another compression", "that of numpy.savez or savez_compressed")
+        return self._archive.open(member)
+
+
+@contextlib.contextmanager
+def open_archive(path: Path | str, wanted: str = "an .npz file (numpy.savez)") -> Iterator[Archive]:
+    """Opens an `.npz` file, of which only headers are read until arrays are asked for.
+
+    Args:
+        path: The file.
+        wanted: What the file should be, for the message.
+
+    Yields:
+        The archive, with `headers` by name and `read`.
+
+    Raises:
+        FileError: The file is absent, unreadable, not an archive, truncated or damaged.
+    """
+    path = Path(path)
+    with open_regular(path, wanted) as stream:
+        try:
+            magic = stream.read(len(_MAGIC))
+            if not zipfile.is_zipfile(stream):
+                _refuse_kind(path, magic, wanted)
+            archive = zipfile.ZipFile(_Bounded(stream))  # type: ignore[arg-type]
+        except FileError:
+            raise
+        except _BROKEN as error:
+            _damaged(path, None, error)
+        with archive:
+            yield Archive(path, archive)
+
+
+def read_archive(path: Path | str) -> dict[str, np.ndarray]:
+    """Reads every array of an `.npz` file; objects are never unpickled.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The arrays by name, in the file's order.
+
+    Raises:
+        FileError: The file is absent, unreadable, not an archive, truncated, damaged, too large, or has an array of
+            objects.
+    """
+    with open_archive(path) as archive:
+        return archive.read(archive.headers)
+
+
+def read_array(path: Path | str) -> np.ndarray:
+    """Reads the one array of an `.npy` file; objects are never unpickled.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The array.
+
+    Raises:
+        FileError: The file is absent, unreadable, of another kind, truncated, too large, or has an array of objects.
+    """
+    path, wanted = Path(path), "an intact .npy file of plain numbers"
+    with open_regular(path, wanted) as stream:
+        try:
+            start = stream.read(_HEADER)
+            if not start.startswith(_MAGIC):
+                raise FileError(path, None, "a file of another kind" if start else "an empty file", wanted)
+            header = _parsed(path, None, start)
+            _refuse_objects(path, None, header.dtype)
+            _check_cost(path, None, header.cost)
+            there = stream.seek(0, io.SEEK_END) - header.offset
+            if there < header.size:
+                raise FileError(path, None, f"{in_bytes(there)} of {in_bytes(header.size)} of data", wanted)
+            stream.seek(header.offset)
+            data = np.fromfile(stream, np.uint8, header.size)
+        except OSError as error:
+            raise FileError(path, None, reason_of(error), wanted) from error
+    return _array(path, None, header, data)
+
+
+class _Bounded:
+    """A file whose reader cannot ask for much at once: zipfile reads the whole directory of an archive in one go."""
+
+    def __init__(self, stream: BinaryIO):
+        self._stream = stream
+        self.seek, self.tell, self.seekable = stream.seek, stream.tell, stream.seekable
+
+    def read(self, size: int = -1) -> bytes:
+        if size > _DIRECTORY:
+            raise zipfile.BadZipFile(f"a directory of {in_bytes(size)}")
+        return self._stream.read(size)
+
+
+def _refuse_kind(path: Path, magic: bytes, wanted: str) -> NoReturn:
+    if magic.startswith(b"PK\x03\x04"):
+        raise FileError(path, None, "a truncated .npz file", "the whole of it")
+    kind = {b"": "an empty file", _MAGIC: "a single .npy array"}.get(magic, "a file of another kind")
+    raise FileError(path, None, kind, wanted)
+
+
+def _parsed(path: Path, name: str | None, start: bytes) -> Header:
+    """The header at the start of an array's file."""
+    stream = io.BytesIO(start)
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version not in ((1, 0), (2, 0), (3, 0)):
+            raise ValueError(f"version {version}")
+        # The third version differs from the second in the names of fields alone, which plain arrays do not have.
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read(stream)
+    except Exception as error:
+        # NumPy reads the header as a Python literal, and answers with any exception that this can end in.
+        raise FileError(path, name, f"a damaged header ({type(error).__name__})", "an array of numpy.save") from error
+    # Truth values are integers to Python, and to NumPy.
+    whole = all(type(length) is int and 0 <= length < 2**62 for length in shape)
+    if not whole or len(shape) > _DIMENSIONS or dtype.subdtype is not None:
+        raise FileError(path, name, "a header that declares no array", "an array of numpy.save")
+    return Header(shape, dtype, fortran_order, stream.tell())
+
+
+def _refuse_objects(path: Path, name: str | None, dtype: np.dtype) -> None:
+    if dtype.hasobject:
+        raise FileError(path, name, "Python objects, which are never unpickled", "a plain array")
+
+
+def _check_cost(path: Path, name: str | None, cost: int) -> None:
+    if cost > allowance():
+        limit = f"at most {in_bytes(allowance())} (see --read-limit)"
+        raise FileError(path, name, f"arrays that take {in_bytes(cost)} in memory", limit)
+
+
+def _array(path: Path, name: str | None, header: Header, data: np.ndarray) -> np.ndarray:
+    """The array of these bytes."""
+    array = np.ndarray(header.shape[::-1] if header.fortran_order else header.shape, header.dtype, data)
+    if array.dtype.kind == "b":
+        # Truth values may be written as any byte; arithmetic knows 0 and 1.
+        array = data.reshape(array.shape) != 0
+    if array.dtype.kind == "U" and array.size and array.dtype.itemsize:
+        codes = data.view(array.dtype.byteorder.replace("|", "=") + "u4")
+        if codes.max() > 0xD7FF and (((codes > 0xD7FF) & (codes < 0xE000)) | (codes > 0x10FFFF)).any():
+            raise FileError(path, name, "text that is no Unicode (surrogates)", "characters")
+    return array.T if header.fortran_order else array
+
+
+def _damaged(path: Path, name: str | None, error: Exception) -> NoReturn:
+    if isinstance(error, FileError):
+        raise error
+    raise FileError(path, name, f"damaged data ({reason_of(error)})", "an intact .npz file") from error

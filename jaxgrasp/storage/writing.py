@@ -1,0 +1,149 @@
+"""Files that take the place of older ones only once they are whole and on the disk.
+
+A new file is written beside its target under a name of its own, which is locked for as long as its process lives. Such
+files of dead processes are therefore those that can be locked, and the next writer in the same folder removes them.
+"""
+
+import contextlib
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+try:
+    import fcntl
+except ImportError:  # Windows, where nobody can remove a file that somebody has open.
+    fcntl = None
+
+_PREFIX, _SUFFIX = ".jaxgrasp-", ".part"
+_unfinished: set[Path] = set()
+
+
+@contextlib.contextmanager
+def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
+    """Opens a file for writing that replaces an older one at the end of the block, or, after an error, does not.
+
+    A symbolic link stays, and the file that it points to is replaced. The older file's permissions are kept.
+
+    Args:
+        path: The file.
+
+    Yields:
+        A stream of bytes.
+
+    Raises:
+        OSError: The file cannot be written; an older one is as it was.
+    """
+    target = _target(path)
+    _sweep(target.parent)
+    part, descriptor = _begin(target.parent)
+    try:
+        with contextlib.suppress(OSError):
+            os.chmod(part, stat.S_IMODE(target.stat().st_mode))
+        # The descriptor stays ours: some libraries close the streams that they write to.
+        with open(descriptor, "wb", closefd=False) as stream:
+            yield stream
+        os.fsync(descriptor)
+        os.replace(part, target)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            part.unlink()
+        os.close(descriptor)
+        _unfinished.discard(part)
+    _make_lasting(target.parent)
+
+
+def check_writable(path: Path | str) -> None:
+    """Finds out whether a file can be written, and leaves everything as it was.
+
+    Raises:
+        OSError: It cannot.
+    """
+    # Permissions of the folder say little about read-only, full or remote ones: only a file in it tells.
+    part, descriptor = _begin(_target(path).parent)
+    part.unlink()
+    os.close(descriptor)
+    _unfinished.discard(part)
+
+
+def unfinished() -> bool:
+    """Whether this process is writing a file now."""
+    return bool(_unfinished)
+
+
+def discard_unfinished() -> None:
+    """Removes the files that this process is writing: for a process that ends at once."""
+    for part in tuple(_unfinished):
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def _target(path: Path | str) -> Path:
+    target = Path(os.path.realpath(path))
+    try:
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return target
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    if not os.access(target, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+    return target
+
+
+def _begin(folder: Path) -> tuple[Path, int]:
+    """A new and locked file in a folder."""
+    while True:
+        part = folder / f"{_PREFIX}{secrets.token_hex(8)}{_SUFFIX}"
+        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0), 0o666)
+        _unfinished.add(part)
+        # Somebody who swept between the two calls has the lock, or has had it and removed the file.
+        if _locked(descriptor) is not False and part.exists():
+            return part, descriptor
+        os.close(descriptor)
+        _unfinished.discard(part)
+
+
+def _sweep(folder: Path) -> None:
+    """Removes what dead processes have left unfinished in a folder."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if not (entry.name.startswith(_PREFIX) and entry.name.endswith(_SUFFIX)):
+                continue
+            with contextlib.suppress(OSError):
+                descriptor = os.open(entry.path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+                try:
+                    if _locked(descriptor):
+                        os.unlink(entry.path)
+                finally:
+                    os.close(descriptor)
+
+
+def _locked(descriptor: int) -> bool | None:
+    """Locks a file; False where another process has, None where the file system knows no locks."""
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _make_lasting(folder: Path) -> None:
+    """The file's new name is on the disk, too; what the file system cannot do is left undone."""
+    if os.name != "posix":
+        return
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
