@@ -8,6 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxgrasp import process
+
 # Loops over lanes are vectors already as XLA writes them: LLVM's costlier passes take long and gain nothing, while the
 # widest registers, which LLVM is shy of, do. Both options are internals of XLA.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
@@ -33,6 +35,7 @@ def compiled(function: Callable[..., Any], static_argnums: tuple[int, ...] = ())
 
     @functools.wraps(function)
     def call(*args: Any) -> Any:
+        process.check()
         with own_settings():
             # Inside somebody's jit every operation gives a tracer, even one on constants.
             traced = any(isinstance(x, jax.core.Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(args)))

@@ -8,9 +8,11 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "jaxgrasp"
 
 FLOORS = {
+    "process": -1,
     "arrays": 0,
     "compiling": 0,
     "fence": 0,
+    "records": 0,
     "kernels": 1,
     "geometry": 2,
     "contact": 2,

@@ -1,17 +1,15 @@
 """Contacts: where the fingers touch, with which friction and strength."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals
+from jaxgrasp.records import record
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Contacts:
     """A batch of grasps by their hard-finger contacts, in the object frame about the centre of mass.
 
@@ -120,6 +118,16 @@ class Contacts:
         return cls.from_frames(
             positions, frames_from_normals(normals), friction=friction, max_force=max_force, active=active
         )
+
+    def check_precision(self) -> None:
+        """Refuse what nothing here can compute with.
+
+        Raises:
+            ValueError: positions that are neither float32 nor float64.
+        """
+        dtype = self.positions.dtype
+        if dtype not in (jnp.float32, jnp.float64):
+            raise ValueError(f"contacts: got dtype {dtype.name}, wanted float32 or float64; cast their leaves")
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

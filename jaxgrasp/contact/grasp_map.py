@@ -1,9 +1,11 @@
 """The grasp map (5) and the wrench that the grasp must supply, (2)-(3)."""
 
+import functools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -68,11 +70,16 @@ def required_wrench(
     """
     if inertia is None and (twist is not None or acceleration is not None):
         raise ValueError("inertia: got None, wanted (*batch, 3, 3) because twist or acceleration is given")
-    m = as_float("mass", mass, ())
-    g = as_float("gravity", gravity, (3,))
-    body = jnp.zeros((3, 3)) if inertia is None else as_float("inertia", inertia, (3, 3))
-    velocity = jnp.zeros(6) if twist is None else as_float("twist", twist, (6,))
-    rate = jnp.zeros(6) if acceleration is None else as_float("acceleration", acceleration, (6,))
+    # Arrays say in which precision, numbers and lists adapt.
+    given = [getattr(x, "dtype", int) for x in (mass, gravity, inertia, twist, acceleration)]
+    given = [dtype for dtype in given if jnp.issubdtype(dtype, jnp.floating)]
+    dtype = functools.reduce(jnp.promote_types, given) if given else jnp.result_type(float)
+    array = lambda name, x, event: as_float(name, np.zeros(event) if x is None else x, event).astype(dtype)  # noqa: E731
+    m = array("mass", mass, ())
+    g = array("gravity", gravity, (3,))
+    body = array("inertia", inertia, (3, 3))
+    velocity = array("twist", twist, (6,))
+    rate = array("acceleration", acceleration, (6,))
     batch = broadcast_batch(
         mass=m.shape,
         gravity=g.shape[:-1],

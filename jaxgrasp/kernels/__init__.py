@@ -1,5 +1,5 @@
 """Fused kernels: one jaxpr, as vector code with one problem per SIMD lane, or a GPU's with one per thread."""
 
-from jaxgrasp.kernels.native import fused, portable, usable, without
+from jaxgrasp.kernels.native import allowed, fused, usable, without
 
-__all__ = ["fused", "portable", "usable", "without"]
+__all__ = ["allowed", "fused", "usable", "without"]

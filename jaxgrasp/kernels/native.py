@@ -40,14 +40,22 @@ _lock = threading.RLock()
 
 @contextlib.contextmanager
 def without() -> Iterator[None]:
-    """What is traced inside runs on XLA alone."""
+    """What is traced inside runs on XLA alone, so that `jax.export` can take it to another machine.
+
+    Programs that were traced outside are traced anew inside. They are several times slower on CPUs, and where arrays are
+    divided over devices XLA divides each operation as it sees fit.
+
+    Example:
+        >>> with jaxgrasp.without_kernels():
+        ...     exported = jax.export.export(jax.jit(margin))(positions)
+    """
     with _allowed(False):
         yield
 
 
-def portable() -> bool:
-    """Whether what is traced now is to run on XLA alone, see `without`."""
-    return not _allowed.value
+def allowed() -> bool:
+    """Whether what is traced now may be more than XLA, see `without`."""
+    return _allowed.value
 
 
 def fused(
@@ -145,6 +153,11 @@ _fused_p.def_abstract_eval(lambda *_, shapes, **__: list(shapes))
 
 
 def _lower(ctx: Any, *leaves: Any, plan: Plan, shapes: Any, otherwise: Any) -> Any:
+    if ctx.module_context.lowering_parameters.for_export:
+        raise ValueError(
+            "jax.export: got a program with jaxgrasp's fused kernels, which are this machine's alone; "
+            "export it inside `with jaxgrasp.without_kernels():`"
+        )
     try:
         name = target(plan)
     except Unsupported:

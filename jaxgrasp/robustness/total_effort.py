@@ -12,6 +12,7 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.records import record
 from jaxgrasp.robustness.answers import Verdict, programs, solved_program, verdict
 from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formulation
 from jaxgrasp.robustness.formulations import check_vertices, tile_of
@@ -38,8 +39,7 @@ _ACCEPTED = {"float64": 1e-7, "float32": 1e-3}
 _NOTHING = {"float64": 1e-8, "float32": 1e-5}
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class TotalEffortSolution:
     """What `least_total_effort` answers."""
 

@@ -25,8 +25,9 @@ from jax.interpreters import batching, mlir, xla
 from jax.sharding import AbstractMesh, AxisType, NamedSharding, PartitionSpec
 
 from jaxgrasp.compiling import own_settings
-from jaxgrasp.kernels import portable
+from jaxgrasp.kernels import allowed
 
+Tree = Any
 Events = tuple[tuple[tuple[int, ...], Any], ...]
 # Of the leaves, which all lanes share, and of the platform.
 Function = Callable[[list[jax.Array], tuple[bool, ...], str], list[jax.Array]]
@@ -46,8 +47,33 @@ def independent(function: Function, leaves: Sequence[jax.Array], shared: tuple[b
         Leaves (lanes, ...).
     """
     given = alike(leaves, shared)
-    devices = None if portable() else _needs_devices()
+    devices = _needs_devices() if allowed() else None
     return _independent_p.bind(*given, function=function, shared=shared, out=out, devices=devices)
+
+
+def one_lane(function: Callable[..., Tree], active: jax.Array, *arguments: Tree) -> Tree:
+    """Run a function of one lane as `independent`; mapped by `jax.vmap`, it is one of many lanes.
+
+    Args:
+        function: takes `active` and the other arguments; it is not differentiated.
+        active: a scalar, which every lane has for itself.
+        arguments: trees of arrays.
+    """
+    leaves, structure = jax.tree.flatten((active, *arguments))
+
+    def at(leaves: Sequence[jax.Array]) -> Tree:
+        return function(*jax.tree.unflatten(structure, leaves))
+
+    def run(leaves: list[jax.Array], shared: tuple[bool, ...], _: str) -> list[jax.Array]:
+        axes = [None if s else 0 for s in shared]
+        return jax.vmap(lambda *one: jax.tree.leaves(at(one)), in_axes=axes)(*leaves)
+
+    with on_one_device():
+        like = jax.eval_shape(at, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves])
+    wanted, structure_out = jax.tree.flatten(like)
+    shared = (False,) + (True,) * (len(leaves) - 1)
+    out = independent(run, [leaves[0][None], *leaves[1:]], shared, tuple((x.shape, x.dtype) for x in wanted))
+    return jax.tree.unflatten(structure_out, [x[0] for x in out])
 
 
 @contextlib.contextmanager
@@ -178,9 +204,7 @@ def merged_axes(
     """
     size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     front = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
-    lanes = next(
-        x.shape[0 if d is None else 1] for x, d, s in zip(front, dims, shared, strict=True) if not s
-    )
+    lanes = next(x.shape[0 if d is None else 1] for x, d, s in zip(front, dims, shared, strict=True) if not s)
     merged = []
     for leaf, dim, is_shared in zip(front, dims, shared, strict=True):
         if is_shared and dim is None:
@@ -196,7 +220,7 @@ def merged_axes(
 
 @functools.cache
 def _needs_devices() -> Any:
-    """JAX lowers a program with its devices known, as partitioning needs them, where it finds such an operation in it."""
+    """Where JAX finds such an operation in a program, it lowers it with its devices known, as partitioning needs them."""
     some = custom_partitioning(lambda x: x)
     some.def_partition(None, sharding_rule="i -> i")
     with on_one_device():

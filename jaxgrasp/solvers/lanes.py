@@ -185,6 +185,8 @@ def tiled(
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
     def in_compact_tiles(leaves: list[jax.Array]) -> Tree:
+        # XLA aborts where it finds more than 10 kB of constants in a tile that is one function.
+        leaves = lax.optimization_barrier(leaves)
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
         largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
         compact = rows > 0 and lanes > size and largest <= LARGEST_LEAF

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program
+from jaxgrasp.solvers.independent import one_lane
 from jaxgrasp.solvers.interior_point import Iterate
 
 # s z is raised to this, so that rows that are only just active, with s and z both zero, keep a finite weight.
@@ -58,7 +59,8 @@ def _solution_jvp(primals: tuple, tangents: tuple) -> tuple[Iterate, Iterate]:
     x, y, s, z = safe = _or(solved, point, Iterate(0.0, 0.0, 1.0, 1.0))
     ratio = _ratio(safe)
     kkt = Embedding(lax.stop_gradient(program), CONSTANTS[x.dtype.name])
-    factors = kkt.reduce(lax.stop_gradient(1 / ratio))
+    factor = lambda _, program, weights: Embedding(program, kkt.constants).reduce(weights)  # noqa: E731
+    factors = one_lane(factor, solved, kkt.program, lax.stop_gradient(1 / ratio))
     parts = lambda v: jnp.split(v, [x.size, x.size + y.size])  # noqa: E731
 
     def matrix(v: jax.Array) -> jax.Array:
