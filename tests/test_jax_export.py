@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export
@@ -20,21 +19,17 @@ def test_kernels_are_not_exported_and_the_error_says_how_else():
 
 
 def test_any_number_of_grasps():
-    one, many = grasps(1), grasps(5)
-    single = jax.tree.map(lambda x: x[0], one)
-    normals = jnp.moveaxis(many.frames[..., 2], 0, 0)
+    normals = grasps(5).frames[..., 2]
 
     def margins(normals):
         contacts = jg.Contacts.from_normals(0.05 * normals, normals, friction=0.5, max_force=1.0)
         return jg.largest_disturbance(contacts, jg.DisturbanceSet.forces(1.0), cone_edges=4).margin
 
-    assert single.n_c == 4
     (count,) = export.symbolic_shape("b")
     with jg.without_kernels():
         made = export.export(jax.jit(margins))(jax.ShapeDtypeStruct((count, 4, 3), normals.dtype))
-    again = export.deserialize(made.serialize())
-    np.testing.assert_allclose(again.call(normals), margins(normals), rtol=1e-7)
-    np.testing.assert_allclose(again.call(normals[:2]), margins(normals)[:2], rtol=1e-7)
+    np.testing.assert_allclose(made.call(normals), margins(normals), rtol=1e-7)
+    np.testing.assert_allclose(made.call(normals[:2]), margins(normals)[:2], rtol=1e-7)
 
 
 def test_a_program_for_another_platform_has_no_kernel_of_this_one():

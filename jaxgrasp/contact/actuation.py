@@ -7,6 +7,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.records import record
 
 # Singular values of B below this share of the largest count as zero.
@@ -37,6 +38,7 @@ class Actuation:
     """N', rows that span what B does not reach (there may be more rows than directions); None where B reaches all."""
 
     @classmethod
+    @own_settings()
     def from_jacobian(
         cls, jacobian: ArrayLike, transmission: ArrayLike, lower: ArrayLike, upper: ArrayLike
     ) -> "Actuation":
@@ -84,6 +86,7 @@ class Actuation:
             unreached=None if unreached is None else unreached.astype(dtype),
         )
 
+    @own_settings()
     def joint_torques(self, forces: Float[Array, "*batch contacts 3"]) -> Float[Array, "*batch joints"]:
         """J'f: the joint torques that put the forces (*batch, n_c, 3), N, contact frames, on the object; N m or N."""
         return jnp.einsum("...iav,...ia->...v", self.jacobian, forces)

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.contact.contacts import Contacts
 
 
@@ -27,6 +28,7 @@ def grasp_columns(positions: jax.Array, frames: jax.Array) -> jax.Array:
     return jnp.concatenate([frames, moments], 0)
 
 
+@own_settings()
 def grasp_map(contacts: Contacts) -> Float[Array, "*batch 6 vars"]:
     """G (5): the wrench about the centre of mass is G f for contact forces f in contact frames.
 
@@ -43,6 +45,7 @@ def grasp_map(contacts: Contacts) -> Float[Array, "*batch 6 vars"]:
     return blocks.reshape(*contacts.batch_shape, 6, 3 * contacts.n_c)
 
 
+@own_settings()
 def required_wrench(
     mass: ArrayLike,
     gravity: ArrayLike | Sequence[float] = (0.0, 0.0, -9.81),

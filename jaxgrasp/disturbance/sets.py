@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.disturbance.terms import Ball, Box, Ellipsoid, Term
 from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.records import record
@@ -42,6 +43,7 @@ class DisturbanceSet:
         )
 
     @classmethod
+    @own_settings()
     def forces(cls, magnitude: ArrayLike = 1.0) -> "DisturbanceSet":
         """The six forces along +-x, +-y, +-z of section V, without moment.
 
@@ -93,6 +95,7 @@ class DisturbanceSet:
             return NotImplemented
         return DisturbanceSet(terms=self.terms + other.terms)
 
+    @own_settings()
     def rotated(self, rotation: ArrayLike) -> "DisturbanceSet":
         """The same set given in another frame, in the object's.
 
@@ -109,6 +112,7 @@ class DisturbanceSet:
         turn = jnp.where(sound[..., None, None], turn, jnp.nan)
         return DisturbanceSet(terms=tuple(term.rotated(turn) for term in self.terms))
 
+    @own_settings()
     def smoothed(self, width: ArrayLike) -> "DisturbanceSet":
         """The same set with a smooth worst case, for optimisers that stumble over the edges of S_1 and S_2.
 
@@ -127,6 +131,7 @@ class DisturbanceSet:
         """Leading axes that the terms have in common."""
         return broadcast_batch(**{f"term {i}": term.batch_shape for i, term in enumerate(self.terms)})
 
+    @own_settings()
     def support(self, directions: ArrayLike) -> Float[Array, "*batch rows"]:
         """h_D(a) = max over w in D of a'w, at least 0.
 

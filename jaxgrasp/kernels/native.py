@@ -42,8 +42,8 @@ _lock = threading.RLock()
 def without() -> Iterator[None]:
     """What is traced inside runs on XLA alone, so that `jax.export` can take it to another machine.
 
-    Programs that were traced outside are traced anew inside. They are several times slower on CPUs, and where arrays are
-    divided over devices XLA divides each operation as it sees fit.
+    Programs that were traced outside are traced anew inside. They are several times slower on CPUs, and where arrays
+    are divided over devices XLA divides each operation as it sees fit.
 
     Example:
         >>> with jaxgrasp.without_kernels():

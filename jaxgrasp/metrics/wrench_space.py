@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, safe_norm
-from jaxgrasp.compiling import compiled
+from jaxgrasp.compiling import compiled, own_settings
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.contacts import rotations
 from jaxgrasp.records import record
@@ -68,6 +68,7 @@ class Edges(NamedTuple):
         return jnp.repeat(self.present, self.wrenches.shape[-2], -1)
 
 
+@own_settings()
 def edge_wrenches(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch contacts edges 6"]:
     """The wrenches by which fingers push along the edges of their friction pyramids.
 

@@ -6,6 +6,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxgrasp.arrays import literal
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
@@ -64,6 +65,7 @@ class Comparison:
     the same bound are not negative; NaN where one of the two has no answer."""
 
 
+@own_settings()
 def compare_formulations(
     contacts: Contacts,
     disturbances: DisturbanceSet,
@@ -159,6 +161,7 @@ class SpecifiedDisturbances:
     """SOLVED where there are such forces, INFEASIBLE where there are none; otherwise as for the margin."""
 
 
+@own_settings()
 def specified_disturbances(
     contacts: Contacts,
     disturbances: DisturbanceSet,

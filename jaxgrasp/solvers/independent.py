@@ -220,7 +220,7 @@ def merged_axes(
 
 @functools.cache
 def _needs_devices() -> Any:
-    """Where JAX finds such an operation in a program, it lowers it with its devices known, as partitioning needs them."""
+    """An operation for whose sake JAX lowers a program with its devices known, as partitioning needs them."""
     some = custom_partitioning(lambda x: x)
     some.def_partition(None, sharding_rule="i -> i")
     with on_one_device():

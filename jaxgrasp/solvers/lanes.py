@@ -6,7 +6,6 @@ Elsewhere they go at once, on GPUs as native code where that is asked for. A ker
 one for each of several programs of a lane.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +28,8 @@ LOOSE_TILE = 1024
 # The same of what a tile is given: half a megabyte.
 LARGEST_LEAF = 1 << 15
 LARGE_TILE = 1 << 17
+# Of batches of any size, small ones among them.
+SMALL_TILE = 64
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def tiled(
         return _in_turn(steps, value)
 
     def in_tiles(leaves: list[jax.Array], tile: int, one: Callable) -> Tree:
-        count = math.ceil(lanes / tile)
+        count = -(-lanes // tile)
         own = [x for x, s in zip(leaves, shared, strict=True) if not s]
         own = [jnp.pad(x, [(0, count * tile - lanes)] + [(0, 0)] * (x.ndim - 1)) for x in own]
 
@@ -206,9 +207,13 @@ def tiled(
     def at_once(leaves: list[jax.Array]) -> Tree:
         return in_tiles(leaves, min(LARGE_TILE, lanes), solve)
 
+    def in_small_tiles(leaves: list[jax.Array]) -> Tree:
+        with fences(platform == "cpu"):
+            return in_tiles(leaves, SMALL_TILE, solve)
+
     if not isinstance(lanes, int):
         # How many there are is known when the program runs.
-        return solve(leaves)
+        return in_small_tiles(leaves)
     whole = partial(_in_turn, (first, *stages[1:]))
     if platform == "cpu":
         return fused(whole, leaves, shared, in_compact_tiles, known_as)

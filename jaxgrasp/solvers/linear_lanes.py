@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, xla
 
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.solvers.independent import alike, independent, merged_axes, types
 from jaxgrasp.solvers.lanes import LOOSE_TILE, tiled
 
@@ -140,6 +141,7 @@ def _shared(spec: _Map, count: int) -> tuple[bool, ...]:
     return spec.shared + (False,) * (count - len(spec.shared))
 
 
+@own_settings()
 def _jvp(primals: Any, dots: Any, *, spec: _Map) -> tuple[list, list]:
     data, tangents = _split(spec, primals)
     data_dots, tangent_dots = _split(spec, dots)

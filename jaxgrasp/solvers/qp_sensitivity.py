@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program
 from jaxgrasp.solvers.independent import one_lane
 from jaxgrasp.solvers.interior_point import Iterate
@@ -50,6 +51,7 @@ def solution_of(program: Program, point: Iterate, solved: jax.Array) -> Iterate:
 
 
 @solution_of.defjvp
+@own_settings()
 def _solution_jvp(primals: tuple, tangents: tuple) -> tuple[Iterate, Iterate]:
     program, _, solved = primals
     # Once more as a function of the program, for derivatives of the derivatives.
@@ -81,6 +83,7 @@ def value_at(program: Program, point: Iterate, value: jax.Array, solved: jax.Arr
 
 
 @value_at.defjvp
+@own_settings()
 def _value_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
     _, point, value, solved = primals
     dP, dq, dA, db, dG, dh = tangents[0]
