@@ -4,7 +4,6 @@ Shapes are written batch first: `*batch` is any number of leading axes. Inside k
 "lanes".
 """
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 
 import jax
@@ -82,6 +81,7 @@ def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
 
 
+@jax.jit
 def frames_from_normals(normals: jax.Array) -> jax.Array:
     """Contact frames (t1, t2, n) of unit normals: the x and y axes turned by the smallest rotation that takes z to n.
 
@@ -94,17 +94,6 @@ def frames_from_normals(normals: jax.Array) -> jax.Array:
     Returns:
         (*batch, 3, 3), columns t1, t2, n; NaN for a normal that is zero or not finite.
     """
-    if isinstance(normals, jax.core.Tracer) or len(normals.sharding.device_set) > 1:
-        return _frames(normals)
-    # Every size is a program of its own, which takes 0.3 s and 8 MB: few sizes serve all direct calls.
-    batch = normals.shape[:-1]
-    rows = math.prod(batch)
-    padded = jnp.pad(normals.reshape(rows, 3), ((0, (1 << max(rows - 1, 0).bit_length()) - rows), (0, 0)))
-    return _frames(padded)[:rows].reshape(*batch, 3, 3)
-
-
-@jax.jit
-def _frames(normals: jax.Array) -> jax.Array:
     largest = jnp.max(jnp.abs(normals), -1, keepdims=True)
     usable = (largest > 0) & jnp.isfinite(largest)
     # Others become z, and NaN at the end alone: derivatives would carry it to everything.

@@ -1,5 +1,7 @@
 """Contacts: where the fingers touch, with which friction and strength."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -76,14 +78,8 @@ class Contacts:
             max_force=max_force.shape[:-1],
             active=present.shape[:-1],
         )
-        dtype = jnp.result_type(positions, frames)
-        return cls(
-            positions=jnp.broadcast_to(positions.astype(dtype), (*batch, n_c, 3)),
-            frames=jnp.broadcast_to(frames.astype(dtype), (*batch, n_c, 3, 3)),
-            friction=jnp.broadcast_to(friction.astype(dtype), (*batch, n_c)),
-            max_force=jnp.broadcast_to(max_force.astype(dtype), (*batch, n_c)),
-            active=jnp.broadcast_to(present, (*batch, n_c)),
-        )
+        leaves = positions, frames, friction, max_force, present
+        return cls(**dict(zip(_EVENTS, _spread(batch, leaves), strict=True)))
 
     @classmethod
     def from_normals(
@@ -138,6 +134,20 @@ class Contacts:
     def n_c(self) -> int:
         """Number of contacts, absent ones included."""
         return self.positions.shape[-2]
+
+
+_EVENTS = {"positions": (3,), "frames": (3, 3), "friction": (), "max_force": (), "active": ()}
+
+
+@functools.partial(jax.jit, static_argnums=(0,))
+def _spread(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.Array]:
+    """The leaves in one precision and with all axes: one program, where each operation would be one by itself."""
+    positions, frames = leaves[:2]
+    dtype, n_c = jnp.result_type(positions, frames), positions.shape[-2]
+    return [
+        jnp.broadcast_to(x if x.dtype == bool else x.astype(dtype), (*batch, n_c, *event))
+        for x, event in zip(leaves, _EVENTS.values(), strict=True)
+    ]
 
 
 def rotations(frames: jax.Array) -> jax.Array:
