@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxgrasp import process
+
 
 def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | str, ...]) -> jax.Array:
     """An array in JAX's floating precision whose trailing axes are `event`.
@@ -23,7 +25,11 @@ def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | s
     Raises:
         ValueError: not real numbers, or another trailing shape.
     """
-    array = jnp.asarray(value)
+    process.check()
+    try:
+        array = jnp.asarray(value)
+    except TypeError:
+        raise ValueError(f"{name}: got {type(value).__name__}, wanted an array of real numbers") from None
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == object:
         raise ValueError(f"{name}: got dtype {array.dtype}, wanted real numbers")
     if not jnp.issubdtype(array.dtype, jnp.floating):

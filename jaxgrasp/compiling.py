@@ -1,21 +1,31 @@
 """Compiling for CPUs: what XLA is told about whole programs, so that they are ready sooner and run faster."""
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from jaxgrasp import process
 
 # Loops over lanes are vectors already as XLA writes them: LLVM's costlier passes take long and gain nothing, while the
 # widest registers, which LLVM is shy of, do. Both options are internals of XLA.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
 
 
+@contextlib.contextmanager
+def own_settings() -> Iterator[None]:
+    """What is traced inside is this library's own, whatever a user of JAX asks of code of his."""
+    with jax.numpy_rank_promotion("allow"):
+        yield
+
+
 def compiled(function: Callable[..., Any], static_argnums: tuple[int, ...] = ()) -> Callable[..., Any]:
     """`jax.jit` with the options that suit this library's kernels, where it is the outermost one.
 
-    JAX takes options for whole programs only: inside somebody's `jax.jit` or `jax.grad` theirs apply.
+    JAX takes options for whole programs only: inside somebody's transformation theirs apply.
     """
     inner = jax.jit(function, static_argnums=static_argnums)
 
@@ -25,16 +35,15 @@ def compiled(function: Callable[..., Any], static_argnums: tuple[int, ...] = ())
 
     @functools.wraps(function)
     def call(*args: Any) -> Any:
-        # Inside somebody's jit every operation gives a tracer, even one on constants.
-        if isinstance(jnp.zeros(()), jax.core.Tracer):
-            return inner(*args)
-        try:
-            return outer()(*args)
-        except ValueError as error:
-            # So JAX refuses to differentiate a program with options.
-            if "compiler_options" not in str(error):
-                raise
-            return inner(*args)
+        process.check()
+        with own_settings():
+            # Inside somebody's jit every operation gives a tracer, even one on constants.
+            traced = any(isinstance(x, jax.core.Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(args)))
+            if traced or jax.config.jax_disable_jit:
+                return inner(*args)
+            # NaN and infinity are answers here.
+            with jax.debug_nans(False), jax.debug_infs(False):
+                return outer()(*args)
 
     return call
 

@@ -3,6 +3,7 @@
 from jaxgrasp import metrics, solvers
 from jaxgrasp.contact import Actuation, Compliance, Contacts, grasp_map, required_wrench
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.kernels import without as without_kernels
 from jaxgrasp.robustness import (
     Comparison,
     FormulationSolution,
@@ -44,5 +45,6 @@ __all__ = [
     "required_wrench",
     "solvers",
     "specified_disturbances",
+    "without_kernels",
     "worst_case",
 ]

@@ -111,7 +111,7 @@ def in_place(folder: Path) -> Iterator[None]:
     there = jax.default_backend() == "gpu"
 
     def fused(function, leaves, shared, otherwise, known_as=None, platform="cpu" if there else "cuda"):
-        wanted = platform == "cuda" and native._allowed.get()
+        wanted = platform == "cuda" and native._allowed.value
         return native.fused(function, leaves, shared, no_kernel if wanted else otherwise, known_as, platform)
 
     def module(program, name, write=gpu.module):
@@ -143,7 +143,7 @@ def emulate(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(cuda, "launch_address", launch_address)
     assert asks in launcher._HANDLER
     patch.setattr(launcher, "_HANDLER", launcher._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
-    patch.setattr(native, "usable", lambda platform: native._allowed.get() and native._works(platform))
+    patch.setattr(native, "usable", lambda platform: native._allowed.value and native._works(platform))
 
 
 # What XLA hands to a handler, see xla/ffi/api/c_api.h.

@@ -140,7 +140,7 @@ def test_shard_map_over_two_devices(batch, direct):
     assert len(devices) >= 2
     mesh = Mesh(np.array(devices[:2]), ("lanes",))
     lanes = PartitionSpec("lanes")
-    sharded = jax.jit(jax.shard_map(largest, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False))
+    sharded = jax.jit(jax.shard_map(largest, mesh=mesh, in_specs=lanes, out_specs=lanes))
     assert_same(harness.as_numpy(sharded(*harness.data_of(batch))), direct)
 
 

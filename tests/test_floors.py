@@ -8,10 +8,12 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "jaxgrasp"
 
 FLOORS = {
+    "process": -1,
     "arrays": 0,
     "compiling": 0,
     "fence": 0,
     "storage": 0,
+    "records": 0,
     "kernels": 1,
     "geometry": 2,
     "contact": 2,

@@ -1,7 +1,5 @@
 """What the joints and actuators of a hand transmit to its contacts."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,13 +7,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.compiling import own_settings
+from jaxgrasp.records import record
 
 # Singular values of B below this share of the largest count as zero.
 _RANK_TOLERANCE = 1e-6
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Actuation:
     """Contact Jacobians, transmission and limits of a hand's actuators: which contact forces the hand can produce.
 
@@ -39,6 +38,7 @@ class Actuation:
     """N', rows that span what B does not reach (there may be more rows than directions); None where B reaches all."""
 
     @classmethod
+    @own_settings()
     def from_jacobian(
         cls, jacobian: ArrayLike, transmission: ArrayLike, lower: ArrayLike, upper: ArrayLike
     ) -> "Actuation":
@@ -68,7 +68,9 @@ class Actuation:
             upper=upper.shape[:-1],
         )
         if given.ndim == 2 and not isinstance(transmission, jax.core.Tracer):
-            left, values, right = np.linalg.svd(np.asarray(transmission, np.float64))
+            # What is not finite makes every grasp inadmissible, here it only must not stop the decomposition.
+            known = np.nan_to_num(np.asarray(transmission, np.float64), posinf=0, neginf=0)
+            left, values, right = np.linalg.svd(known)
             rank = int(np.sum(values > _RANK_TOLERANCE * max(values.max(initial=0), np.finfo(float).tiny)))
             inverse = jnp.asarray((right[:rank].T / values[:rank]) @ left[:, :rank].T, dtype)
             unreached = jnp.asarray(left[:, rank:].T, dtype) if rank < joints else None
@@ -84,6 +86,7 @@ class Actuation:
             unreached=None if unreached is None else unreached.astype(dtype),
         )
 
+    @own_settings()
     def joint_torques(self, forces: Float[Array, "*batch contacts 3"]) -> Float[Array, "*batch joints"]:
         """J'f: the joint torques that put the forces (*batch, n_c, 3), N, contact frames, on the object; N m or N."""
         return jnp.einsum("...iav,...ia->...v", self.jacobian, forces)

@@ -5,7 +5,6 @@ orthonormalised. A row that is a combination of the earlier ones to within `RANK
 nothing and is dropped.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -16,12 +15,12 @@ from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.fence import each, fenced, repeat
+from jaxgrasp.records import record
 
 RANK_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Compliance:
     """One compliance Q_j for each disturbance vertex; a single Q for all is given as a plain array instead."""
 

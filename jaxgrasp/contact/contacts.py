@@ -1,6 +1,6 @@
 """Contacts: where the fingers touch, with which friction and strength."""
 
-from dataclasses import dataclass
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +8,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals
+from jaxgrasp.records import record
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Contacts:
     """A batch of grasps by their hard-finger contacts, in the object frame about the centre of mass.
 
@@ -78,14 +78,8 @@ class Contacts:
             max_force=max_force.shape[:-1],
             active=present.shape[:-1],
         )
-        dtype = jnp.result_type(positions, frames)
-        return cls(
-            positions=jnp.broadcast_to(positions.astype(dtype), (*batch, n_c, 3)),
-            frames=jnp.broadcast_to(frames.astype(dtype), (*batch, n_c, 3, 3)),
-            friction=jnp.broadcast_to(friction.astype(dtype), (*batch, n_c)),
-            max_force=jnp.broadcast_to(max_force.astype(dtype), (*batch, n_c)),
-            active=jnp.broadcast_to(present, (*batch, n_c)),
-        )
+        leaves = positions, frames, friction, max_force, present
+        return cls(**dict(zip(_EVENTS, _spread(batch, leaves), strict=True)))
 
     @classmethod
     def from_normals(
@@ -121,6 +115,16 @@ class Contacts:
             positions, frames_from_normals(normals), friction=friction, max_force=max_force, active=active
         )
 
+    def check_precision(self) -> None:
+        """Refuse what nothing here can compute with.
+
+        Raises:
+            ValueError: positions that are neither float32 nor float64.
+        """
+        dtype = self.positions.dtype
+        if dtype not in (jnp.float32, jnp.float64):
+            raise ValueError(f"contacts: got dtype {dtype.name}, wanted float32 or float64; cast their leaves")
+
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """The leading axes."""
@@ -130,6 +134,20 @@ class Contacts:
     def n_c(self) -> int:
         """Number of contacts, absent ones included."""
         return self.positions.shape[-2]
+
+
+_EVENTS = {"positions": (3,), "frames": (3, 3), "friction": (), "max_force": (), "active": ()}
+
+
+@functools.partial(jax.jit, static_argnums=(0,))
+def _spread(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.Array]:
+    """The leaves in one precision and with all axes: one program, where each operation would be one by itself."""
+    positions, frames = leaves[:2]
+    dtype, n_c = jnp.result_type(positions, frames), positions.shape[-2]
+    return [
+        jnp.broadcast_to(x if x.dtype == bool else x.astype(dtype), (*batch, n_c, *event))
+        for x, event in zip(leaves, _EVENTS.values(), strict=True)
+    ]
 
 
 def rotations(frames: jax.Array) -> jax.Array:

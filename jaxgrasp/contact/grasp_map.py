@@ -1,13 +1,16 @@
 """The grasp map (5) and the wrench that the grasp must supply, (2)-(3)."""
 
+import functools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.contact.contacts import Contacts
 
 
@@ -25,6 +28,7 @@ def grasp_columns(positions: jax.Array, frames: jax.Array) -> jax.Array:
     return jnp.concatenate([frames, moments], 0)
 
 
+@own_settings()
 def grasp_map(contacts: Contacts) -> Float[Array, "*batch 6 vars"]:
     """G (5): the wrench about the centre of mass is G f for contact forces f in contact frames.
 
@@ -41,6 +45,7 @@ def grasp_map(contacts: Contacts) -> Float[Array, "*batch 6 vars"]:
     return blocks.reshape(*contacts.batch_shape, 6, 3 * contacts.n_c)
 
 
+@own_settings()
 def required_wrench(
     mass: ArrayLike,
     gravity: ArrayLike | Sequence[float] = (0.0, 0.0, -9.81),
@@ -68,11 +73,16 @@ def required_wrench(
     """
     if inertia is None and (twist is not None or acceleration is not None):
         raise ValueError("inertia: got None, wanted (*batch, 3, 3) because twist or acceleration is given")
-    m = as_float("mass", mass, ())
-    g = as_float("gravity", gravity, (3,))
-    body = jnp.zeros((3, 3)) if inertia is None else as_float("inertia", inertia, (3, 3))
-    velocity = jnp.zeros(6) if twist is None else as_float("twist", twist, (6,))
-    rate = jnp.zeros(6) if acceleration is None else as_float("acceleration", acceleration, (6,))
+    # Arrays say in which precision, numbers and lists adapt.
+    given = [getattr(x, "dtype", int) for x in (mass, gravity, inertia, twist, acceleration)]
+    given = [dtype for dtype in given if jnp.issubdtype(dtype, jnp.floating)]
+    dtype = functools.reduce(jnp.promote_types, given) if given else jnp.result_type(float)
+    array = lambda name, x, event: as_float(name, np.zeros(event) if x is None else x, event).astype(dtype)  # noqa: E731
+    m = array("mass", mass, ())
+    g = array("gravity", gravity, (3,))
+    body = array("inertia", inertia, (3, 3))
+    velocity = array("twist", twist, (6,))
+    rate = array("acceleration", acceleration, (6,))
     batch = broadcast_batch(
         mass=m.shape,
         gravity=g.shape[:-1],

@@ -1,6 +1,6 @@
 """Disturbance sets and their Minkowski sums."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +9,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.disturbance.terms import Ball, Box, Ellipsoid, Term
 from jaxgrasp.disturbance.vertices import Vertices
+from jaxgrasp.records import record
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class DisturbanceSet:
     """A convex set D of wrenches that contains the origin; force N, moment N m, object frame, about the centre of mass.
 
@@ -42,6 +43,7 @@ class DisturbanceSet:
         )
 
     @classmethod
+    @own_settings()
     def forces(cls, magnitude: ArrayLike = 1.0) -> "DisturbanceSet":
         """The six forces along +-x, +-y, +-z of section V, without moment.
 
@@ -93,18 +95,24 @@ class DisturbanceSet:
             return NotImplemented
         return DisturbanceSet(terms=self.terms + other.terms)
 
+    @own_settings()
     def rotated(self, rotation: ArrayLike) -> "DisturbanceSet":
         """The same set given in another frame, in the object's.
 
         Args:
-            rotation: (*batch, 3, 3), R_object_other: columns are the other frame's axes in the object frame.
+            rotation: (*batch, 3, 3), R_object_other: columns are the other frame's axes in the object frame. One that
+                is no rotation makes its grasp `Status.INVALID_INPUT`.
 
         Raises:
             ValueError: another shape.
         """
         turn = as_float("rotation", rotation, (3, 3))
+        apart = jnp.abs(jnp.swapaxes(turn, -1, -2) @ turn - jnp.eye(3, dtype=turn.dtype)).max((-2, -1))
+        sound = (apart <= (1e-6 if turn.dtype == jnp.float64 else 1e-4)) & (jnp.linalg.det(turn) > 0)
+        turn = jnp.where(sound[..., None, None], turn, jnp.nan)
         return DisturbanceSet(terms=tuple(term.rotated(turn) for term in self.terms))
 
+    @own_settings()
     def smoothed(self, width: ArrayLike) -> "DisturbanceSet":
         """The same set with a smooth worst case, for optimisers that stumble over the edges of S_1 and S_2.
 
@@ -123,6 +131,7 @@ class DisturbanceSet:
         """Leading axes that the terms have in common."""
         return broadcast_batch(**{f"term {i}": term.batch_shape for i, term in enumerate(self.terms)})
 
+    @own_settings()
     def support(self, directions: ArrayLike) -> Float[Array, "*batch rows"]:
         """h_D(a) = max over w in D of a'w, at least 0.
 

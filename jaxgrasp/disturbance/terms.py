@@ -9,7 +9,7 @@ With a width w > 0 (N) the support functions are smooth and by some w larger: lo
 maximum over vertices and the origin, sqrt(x^2 + w^2) in place of |x|.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol, Self
 
 import jax
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import fold, safe_divide, safe_norm
+from jaxgrasp.records import record
 
 
 class Term(Protocol):
@@ -87,8 +88,7 @@ def align(leaf: jax.Array, like: jax.Array) -> jax.Array:
     return leaf.reshape((1,) * (like.ndim - leaf.ndim) + leaf.shape) if leaf.ndim else leaf
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Box:
     """|w_i| <= half_extents_i in a frame whose axes are columns of `axes` (None: the object's)."""
 
@@ -161,8 +161,7 @@ class Box:
         return checked(jnp.where((self.half_extents >= 0).all(-1, keepdims=True), turned, -1), self.width)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Ellipsoid:
     """L u with |u| <= 1."""
 
@@ -204,8 +203,7 @@ class Ellipsoid:
         return checked(jnp.linalg.norm(self.shape_matrix, axis=-1), self.width)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Ball:
     """A ball of forces and, independently, one of moments."""
 
@@ -224,8 +222,8 @@ class Ball:
         return Ball(force=force, torque=torque, width=spread(self.width, batch))
 
     def rotated(self, rotation: jax.Array) -> "Ball":
-        """A ball stays what it is."""
-        return self
+        """A ball stays what it is, but for what is no rotation."""
+        return replace(self, force=self.force + 0 * rotation[..., 0, 0])
 
     def support(self, directions: jax.Array) -> jax.Array:
         """Force |a_f| + torque |a_m|."""

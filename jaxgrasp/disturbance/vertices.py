@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 from jaxgrasp.arrays import fold
 from jaxgrasp.disturbance.terms import align, checked, combine, common, spread
 from jaxgrasp.fence import fenced
+from jaxgrasp.records import record
 
 Tree = Any
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Vertices:
     """The convex hull of wrenches and the origin."""
 

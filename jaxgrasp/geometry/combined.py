@@ -1,9 +1,7 @@
 """Shapes made of others: smooth unions, and shapes that are moved and turned."""
 
 import itertools
-from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -11,13 +9,13 @@ from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float
 from jaxgrasp.geometry.shape import Shape, size
+from jaxgrasp.records import record
 
 # Rotations are refused beyond this: single precision leaves 1e-6.
 _ORTHOGONAL = 1e-4
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class SmoothUnion(Shape):
     """Two shapes in one, with a fillet where they meet."""
 
@@ -59,8 +57,7 @@ class SmoothUnion(Shape):
         return jnp.minimum(low_a, low_b) - fillet, jnp.maximum(high_a, high_b) + fillet
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Placed(Shape):
     """A shape that is turned about its own origin and then moved."""
 

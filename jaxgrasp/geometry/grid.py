@@ -1,8 +1,5 @@
 """A shape whose distance is looked up: quadratic B-splines on a regular grid."""
 
-from dataclasses import dataclass
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -10,10 +7,10 @@ from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import fold, safe_norm
 from jaxgrasp.geometry.shape import Shape
+from jaxgrasp.records import record
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class DistanceGrid(Shape):
     """Signed distances at the nodes of a grid and, between them, once continuously differentiable.
 

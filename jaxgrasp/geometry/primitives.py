@@ -1,18 +1,15 @@
 """Spheres, ellipsoids, boxes, capsules, cylinders and superquadrics about the origin of the object's frame."""
 
-from dataclasses import dataclass
-
-import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, fold, safe_divide, safe_norm
 from jaxgrasp.geometry.shape import Shape, size
+from jaxgrasp.records import record
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Sphere(Shape):
     """A ball."""
 
@@ -38,8 +35,7 @@ class Sphere(Shape):
         return _about_origin(jnp.stack([self.radius] * 3))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Superquadric(Shape):
     """The points with (|x/a|^q + |y/b|^q)^(p/q) + |z/c|^p <= 1: ellipsoids, and boxes and cylinders without edges."""
 
@@ -88,8 +84,7 @@ class Superquadric(Shape):
         return _about_origin(self.semi_axes)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Ellipsoid(Shape):
     """The points with |(x/a, y/b, z/c)| <= 1."""
 
@@ -118,8 +113,7 @@ class Ellipsoid(Shape):
         return _about_origin(self.semi_axes)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Box(Shape):
     """A box along the axes, its edges rounded."""
 
@@ -152,8 +146,7 @@ class Box(Shape):
         return _about_origin(self.half_extents)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Capsule(Shape):
     """A cylinder along z with half balls on its ends."""
 
@@ -183,8 +176,7 @@ class Capsule(Shape):
         return _about_origin(jnp.stack([self.radius, self.radius, self.radius + self.half_length]))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Cylinder(Shape):
     """A cylinder along z, its two edges rounded."""
 

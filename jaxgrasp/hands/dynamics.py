@@ -49,7 +49,7 @@ def joint_dynamics(
     inertia += jnp.einsum("nbvi,nbwi,bi->nvw", angular, angular, inertias)
     inertia += jnp.diag(jnp.asarray(model.dof_armature[hand.dofs], qpos.dtype))
     weight = -jnp.einsum("nbvi,b,i->nv", linear, masses, jnp.asarray(model.opt.gravity, qpos.dtype))
-    return inertia.reshape(*batch, *inertia.shape[1:]), weight.reshape(*batch, -1)
+    return inertia.reshape(*batch, *inertia.shape[1:]), weight.reshape(*batch, *weight.shape[1:])
 
 
 def object_inertia(model: mujoco.MjModel, body: int) -> Float[np.ndarray, "3 3"]:

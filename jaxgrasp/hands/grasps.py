@@ -1,16 +1,13 @@
 """What a hand in a configuration does to an object: contacts, and which forces its actuators can give them."""
 
-from dataclasses import dataclass
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxgrasp.contact import Actuation, Contacts
+from jaxgrasp.records import record
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class HandGrasps:
     """Grasps of a `HandObject` in a batch of configurations."""
 

@@ -210,7 +210,7 @@ class HandObject:
         stiffness = as_float("tip_stiffness", tip_stiffness, ())
         jacobian = grasps.actuation.jacobian
         flexible = jnp.linalg.pinv(grasps.joint_stiffness, rtol=1e-9)
-        tall = jacobian.reshape(*jacobian.shape[:-3], -1, jacobian.shape[-1])
+        tall = jacobian.reshape(*jacobian.shape[:-3], 3 * jacobian.shape[-3], jacobian.shape[-1])
         tips = jnp.broadcast_to(1 / stiffness, jacobian.shape[:-2]) if stiffness.ndim == 0 else 1 / stiffness
         tips = jnp.broadcast_to(jnp.repeat(tips, 3, -1), tall.shape[:-1])
         return tall @ flexible @ jnp.swapaxes(tall, -1, -2) + tips[..., None] * jnp.eye(

@@ -6,20 +6,20 @@ Where anything is missing, XLA runs the same function instead, with one warning 
 """
 
 import contextlib
-import contextvars
 import functools
 import gc
 import os
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Primitive
-from jax.interpreters import mlir
+from jax.interpreters import mlir, xla
 
 from jaxgrasp.fence import loops
 from jaxgrasp.kernels import cpu, fingerprint, gpu, machine, outline
@@ -33,19 +33,30 @@ SETTING = "JAXGRASP_KERNELS"
 _SETTINGS = ("auto", "xla", "fused")
 # What makes kernels, by the platforms' names in JAX.
 _MAKERS: dict[str, Any] = {"cpu": cpu, "cuda": gpu}
-_allowed = contextvars.ContextVar("allowed", default=True)
+# A context of JAX's, so that programs are traced anew where it changes.
+_allowed = jax.make_user_context(True)
 _trusted = True
 _lock = threading.RLock()
 
 
 @contextlib.contextmanager
 def without() -> Iterator[None]:
-    """What is traced inside runs on XLA alone."""
-    token = _allowed.set(False)
-    try:
+    """What is traced inside runs on XLA alone, so that `jax.export` can take it to another machine.
+
+    Programs that were traced outside are traced anew inside. They are several times slower on CPUs, and where arrays
+    are divided over devices XLA divides each operation as it sees fit.
+
+    Example:
+        >>> with jaxgrasp.without_kernels():
+        ...     exported = jax.export.export(jax.jit(margin))(positions)
+    """
+    with _allowed(False):
         yield
-    finally:
-        _allowed.reset(token)
+
+
+def allowed() -> bool:
+    """Whether what is traced now may be more than XLA, see `without`."""
+    return _allowed.value
 
 
 def distrust() -> None:
@@ -144,11 +155,16 @@ def _planned(
 # A primitive, so that kernels whose results nobody uses are never compiled.
 _fused_p = Primitive("fused")
 _fused_p.multiple_results = True
-_fused_p.def_impl(lambda *leaves, **params: jax.jit(functools.partial(_fused_p.bind, **params))(*leaves))
+_fused_p.def_impl(functools.partial(xla.apply_primitive, _fused_p))
 _fused_p.def_abstract_eval(lambda *_, shapes, **__: list(shapes))
 
 
 def _lower(ctx: Any, *leaves: Any, plan: Plan, shapes: Any, otherwise: Any) -> Any:
+    if ctx.module_context.lowering_parameters.for_export:
+        raise ValueError(
+            "jax.export: got a program with jaxgrasp's fused kernels, which are this machine's alone; "
+            "export it inside `with jaxgrasp.without_kernels():`"
+        )
     try:
         name = target(plan)
     except Unsupported:
@@ -171,7 +187,7 @@ def usable(platform: str = "cpu") -> bool:
     asked = os.environ.get(SETTING, "auto")
     if asked not in _SETTINGS:
         raise ValueError(f"{SETTING}: got {asked!r}, wanted {', '.join(_SETTINGS[:-1])} or {_SETTINGS[-1]}")
-    if not _trusted or not _allowed.get() or asked == "xla" or (platform == "cuda" and asked != "fused"):
+    if not _trusted or not _allowed.value or asked == "xla" or (platform == "cuda" and asked != "fused"):
         return False
     return jax.default_backend() == {"cpu": "cpu", "cuda": "gpu"}[platform] and _works(platform)
 
@@ -181,15 +197,9 @@ def _works(platform: str) -> bool:
     """Try the smallest kernel: where XLA's structures differ from what kernels expect, its result stays untouched."""
     try:
         machine.machine()
-        start = np.arange(3, dtype=np.float32)
-        one = [jax.ShapeDtypeStruct((1,), np.float32)]
-        with _lock:
-            name = target(_planned(lambda x: x[0] + 1, one, (False,), None, platform))
-        with jax.ensure_compile_time_eval():
-            given = jax.device_put(start, jax.local_devices(backend=_MAKERS[platform].PLATFORM.lower())[0])
-            out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(given)
-        if not np.array_equal(np.asarray(out), start + 1):
-            raise Unavailable("this version of XLA hands arrays over in another way")
+        # A thread of its own knows of no mesh, trace or setting of whoever comes first.
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(_try, platform).result()
     except Unavailable as error:
         _tell(str(error))
     except Unsupported:
@@ -199,6 +209,17 @@ def _works(platform: str) -> bool:
     else:
         return True
     return False
+
+
+def _try(platform: str) -> None:
+    start = np.arange(3, dtype=np.float32)
+    one = [jax.ShapeDtypeStruct((1,), np.float32)]
+    with _lock:
+        name = target(_planned(lambda x: x[0] + 1, one, (False,), None, platform))
+    given = jax.device_put(start, jax.local_devices(backend=_MAKERS[platform].PLATFORM.lower())[0])
+    out = jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), np.float32))(given)
+    if not np.array_equal(np.asarray(out), start + 1):
+        raise Unavailable("this version of XLA hands arrays over in another way")
 
 
 @functools.cache

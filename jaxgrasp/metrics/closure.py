@@ -1,7 +1,5 @@
 """Force closure: the min-weight of the edges, and what proves that there is closure or none."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -9,7 +7,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.compliance import RANK_TOLERANCE
-from jaxgrasp.metrics.wrench_space import Edges, WrenchSpace, edges_of, hidden
+from jaxgrasp.metrics.wrench_space import Edges, WrenchSpace, edges_of, hidden, metric
+from jaxgrasp.records import record
 from jaxgrasp.solvers import QPSolution, solve_qp
 from jaxgrasp.solvers.status import Status
 
@@ -17,8 +16,7 @@ from jaxgrasp.solvers.status import Status
 _LEAST_WEIGHT = {"float64": 1e-7, "float32": 1e-4}
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class ForceClosure:
     """Whether grasps have force closure, with the certificate of either answer."""
 
@@ -37,6 +35,7 @@ class ForceClosure:
     """SOLVED, INVALID_INPUT, or MAX_ITERATIONS where the program could not be solved and nothing is proved."""
 
 
+@metric
 def min_weight(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
     """The largest least weight with which the edge wrenches average to zero.
 
@@ -65,6 +64,7 @@ def min_weight(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Ar
     return _above_rounding(edges, _weight(edges, _dual(edges)), _spans(edges, _decomposed(edges)[1]))
 
 
+@metric
 def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> ForceClosure:
     """Tests for force closure with friction pyramids, and proves the answer.
 

@@ -7,6 +7,7 @@ vertices of the polar, which are facets of H. From each of several starts affine
 them, with the objective made linear anew at every step, so that |n| only grows; the best counts.
 """
 
+import math
 from functools import partial
 from typing import Literal
 
@@ -17,9 +18,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import safe_divide
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.metrics.interior import SMALLEST_BALL, contains_origin
-from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, hidden
+from jaxgrasp.metrics.wrench_space import WrenchSpace, checked, edges_of, hidden
+from jaxgrasp.solvers.independent import one_lane
 
 Norm = Literal["L1", "Linf"]
 
@@ -53,9 +56,14 @@ def ferrari_canny_bound(
     Raises:
         ValueError: options or shapes that do not fit.
     """
+    return _bound(contacts, check_norm(norm), checked(contacts, space))
+
+
+@partial(compiled, static_argnums=(1,))
+def _bound(contacts: Contacts, norm: Norm, space: WrenchSpace) -> jax.Array:
     edges = edges_of(contacts, space)
-    wrenches = edges.wrenches if check_norm(norm) == "Linf" else edges.flat[..., None, :, :]
-    flat = wrenches.reshape(-1, *wrenches.shape[-3:])
+    wrenches = edges.wrenches if norm == "Linf" else edges.flat[..., None, :, :]
+    flat = wrenches.reshape(math.prod(edges.valid.shape), *wrenches.shape[-3:])
     return hidden(edges, jax.vmap(_radius)(flat).reshape(edges.valid.shape))
 
 
@@ -70,14 +78,13 @@ def check_norm(norm: str) -> Norm:
     return norm
 
 
-@jax.jit
 def _radius(wrenches: jax.Array) -> jax.Array:
     """Of one grasp, wrenches (g, k, 6): h(u) = sum over the groups g of the largest u'w among k and 0."""
     longest = jnp.sqrt(jnp.max(jnp.sum(wrenches * wrenches, -1)))
     scale = lax.stop_gradient(jnp.where(longest > 0, longest, 1))
     W = wrenches / scale
     closed = contains_origin(W.reshape(-1, 6))
-    n, weights = lax.stop_gradient(_farthest(lax.stop_gradient(W)))
+    n, weights = one_lane(lambda _, W: _farthest(W), longest > 0, lax.stop_gradient(W))
     # The last step of a walk along an unbounded polar may have none.
     weights = jnp.where(jnp.isfinite(weights), weights, 0)
     size = jnp.sqrt(n @ n)

@@ -8,9 +8,10 @@ from jaxtyping import Array, Float
 from jaxgrasp.arrays import safe_divide, safe_norm
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.compliance import RANK_TOLERANCE
-from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, hidden
+from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, hidden, metric
 
 
+@metric
 def smallest_singular_value(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
     """The smallest of the six singular values of the grasp map: how far the grasp is from one that loses a direction.
 
@@ -32,6 +33,7 @@ def smallest_singular_value(contacts: Contacts, space: WrenchSpace | None = None
     return hidden(edges, _extreme(edges.grasp_map)[0])
 
 
+@metric
 def isotropy(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
     """The smallest over the largest singular value of the grasp map, 1 where all directions are alike.
 
@@ -53,6 +55,7 @@ def isotropy(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Arra
     return hidden(edges, safe_divide(*_extreme(edges.grasp_map)))
 
 
+@metric
 def closure_residual(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
     """|G c|, the wrench that is left where every finger pushes with a normal force of 1: the smaller the better.
 
@@ -79,7 +82,7 @@ def closure_residual(contacts: Contacts, space: WrenchSpace | None = None) -> Fl
 
 def _extreme(blocks: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The sixth and the first singular value of G from blocks (*batch, n_c, 6, 3)."""
-    G = jnp.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], 6, -1)
+    G = jnp.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], 6, 3 * blocks.shape[-3])
     # The derivative of a singular value is that of |G'u| with its own u held.
     held = lax.stop_gradient(G)
     u = jnp.linalg.eigh(held @ jnp.swapaxes(held, -1, -2))[1]

@@ -1,13 +1,15 @@
 """How much of a task the grasp wrench space holds."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import broadcast_batch, safe_norm
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices
-from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of
+from jaxgrasp.metrics.wrench_space import WrenchSpace, checked, edges_of
 from jaxgrasp.solvers import solve_qp
 from jaxgrasp.solvers.status import Status
 
@@ -38,18 +40,25 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
     Raises:
         ValueError: a set that is not given by vertices, options or shapes that do not fit.
     """
-    edges = edges_of(contacts, space)
+    space = checked(contacts, space)
     terms = task.terms
     if len(terms) != 1 or not isinstance(terms[0], Vertices) or terms[0].width is not None:
         raise ValueError(
             "task: got a set without vertices, wanted DisturbanceSet.vertices or DisturbanceSet.forces "
             "(--disturbances forces or a FILE)"
         )
+    return _scaled(contacts, terms[0].wrenches, space)
+
+
+@compiled
+def _scaled(contacts: Contacts, vertices: jax.Array, space: WrenchSpace) -> jax.Array:
+    """The least of what the vertices, one by one, may be scaled by."""
+    edges = edges_of(contacts, space)
     W, dtype = edges.flat, edges.wrenches.dtype
-    vertices = terms[0].wrenches.astype(dtype)
+    vertices = vertices.astype(dtype)
     batch = broadcast_batch(contacts=edges.valid.shape, task=vertices.shape[:-2])
     force, moment = vertices[..., :3], vertices[..., 3:]
-    if space is not None and space.reference is not None:
+    if space.reference is not None:
         moment = moment - jnp.cross(jnp.asarray(space.reference, dtype)[..., None, :], force)
     length = edges.length[..., None, None]
     size = (*batch, vertices.shape[-2], 3)

@@ -1,8 +1,10 @@
 """The wrenches along the edges of the friction pyramids, which the field's metrics are made of, and their units."""
 
+import functools
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import field
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +13,15 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, safe_norm
+from jaxgrasp.compiling import compiled, own_settings
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.contacts import rotations
+from jaxgrasp.records import record
+
+T = TypeVar("T")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class WrenchSpace:
     """The conventions on which every metric of wrenches depends: edges, unit of moments and point of reference.
 
@@ -54,7 +59,8 @@ class Edges(NamedTuple):
     @property
     def flat(self) -> jax.Array:
         """(*batch, n_c n_e, 6)."""
-        return self.wrenches.reshape(*self.valid.shape, -1, 6)
+        contacts, edges = self.wrenches.shape[-3:-1]
+        return self.wrenches.reshape(*self.valid.shape, contacts * edges, 6)
 
     @property
     def counted(self) -> jax.Array:
@@ -62,6 +68,7 @@ class Edges(NamedTuple):
         return jnp.repeat(self.present, self.wrenches.shape[-2], -1)
 
 
+@own_settings()
 def edge_wrenches(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Array, "*batch contacts edges 6"]:
     """The wrenches by which fingers push along the edges of their friction pyramids.
 
@@ -80,17 +87,38 @@ def edge_wrenches(contacts: Contacts, space: WrenchSpace | None = None) -> Float
     return jnp.where(edges.valid[..., None, None, None], edges.wrenches, jnp.nan)
 
 
-def edges_of(contacts: Contacts, space: WrenchSpace | None = None) -> Edges:
-    """See `edge_wrenches`; nothing here is NaN."""
+def metric(function: Callable[[Contacts, WrenchSpace], T]) -> Callable[..., T]:
+    """A metric of contacts in a space, checked, and compiled once for their shapes."""
+    run = compiled(function)
+
+    @functools.wraps(function)
+    def call(contacts: Contacts, space: WrenchSpace | None = None) -> T:
+        return run(contacts, checked(contacts, space))
+
+    return call
+
+
+def checked(contacts: Contacts, space: WrenchSpace | None) -> WrenchSpace:
+    """The space, or the usual one.
+
+    Raises:
+        ValueError: these are no contacts, or a space without pyramids.
+    """
     if not isinstance(contacts, Contacts):
         raise ValueError(f"contacts: got {type(contacts).__name__}, wanted jaxgrasp.Contacts")
+    contacts.check_precision()
     space = space or WrenchSpace()
     if int(space.cone_edges) != space.cone_edges or space.cone_edges < 3:
         raise ValueError(f"cone_edges: got {space.cone_edges}, wanted an integer of at least 3")
-    return _edges(contacts, space)
+    return space
 
 
-@jax.jit
+def edges_of(contacts: Contacts, space: WrenchSpace | None = None) -> Edges:
+    """See `edge_wrenches`; nothing here is NaN."""
+    return _edges(contacts, checked(contacts, space))
+
+
+@compiled
 def _edges(contacts: Contacts, space: WrenchSpace) -> Edges:
     dtype = contacts.positions.dtype
     about = as_float("reference", np.zeros(3) if space.reference is None else space.reference, (3,)).astype(dtype)
@@ -107,7 +135,7 @@ def _edges(contacts: Contacts, space: WrenchSpace) -> Edges:
     length = jnp.broadcast_to(jnp.where(usable, unit, 1), batch)
     if space.length is None:
         count = jnp.maximum(present.sum(-1, dtype=dtype), 1)
-        length = safe_norm(arms.reshape(*batch, -1)) / jnp.sqrt(count)
+        length = safe_norm(arms.reshape(*batch, 3 * contacts.n_c)) / jnp.sqrt(count)
         length = jnp.where(length > 0, length, 1)
     moments = jnp.cross(arms[..., None, :], jnp.swapaxes(frames, -1, -2)) / length[..., None, None, None]
     blocks = jnp.concatenate([frames, jnp.swapaxes(moments, -1, -2)], -2)

@@ -131,9 +131,7 @@ def _solve_tile(
         task = {"required_wrench": load, "cone_edges": cone_edges, "actuation": actuation}
         return solver(contacts, disturbances, task, columns)
 
-    spread = jax.shard_map(
-        on_one_device, mesh=mesh, in_specs=(P("candidates"), P(), P()), out_specs=P("candidates"), check_vma=False
-    )
+    spread = jax.shard_map(on_one_device, mesh=mesh, in_specs=(P("candidates"), P(), P()), out_specs=P("candidates"))
     return spread(columns, disturbances, gravity)
 
 

@@ -1,12 +1,12 @@
 """The chain's formulations, from the outcome of their programs to what is told about the grasps."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxgrasp.records import record
 from jaxgrasp.robustness.chain import Basics, Formulation, Scaled
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.solvers import embedding
@@ -21,8 +21,7 @@ _CURVED = {"float64": 1e-10, "float32": 1e-5}
 ACCEPTED = {"float64": 1e-7, "float32": 3e-4}
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class FormulationSolution:
     """What `formulation_margin` answers."""
 

@@ -1,5 +1,6 @@
 """The public, batch-first arguments side by side: which leaves have the batch axes, and which all grasps share."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,7 +93,7 @@ def laid_out(contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> A
         shared[name] = not lead and name not in own
         if not shared[name]:
             event = leaf.shape[len(lead) :]
-            leaf = jnp.broadcast_to(leaf, (*batch, *event)).reshape(-1, *event)
+            leaf = jnp.broadcast_to(leaf, (*batch, *event)).reshape(math.prod(batch), *event)
         arguments[name] = leaf
     return Arguments(arguments, shared, batch, structure)
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import Compliance, pseudo_inverse
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
@@ -44,7 +45,9 @@ class _BlockingForces(Plain):
         scaled = grasps.terms[0].wrenches * grasps.units
         if grasps.vertex_halves is None:
             inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
-            forces = -jnp.einsum("aen...,de...->dna...", inverse, scaled)
+            # Spelt out: products of matrices are library calls, which a tile cannot make.
+            parts = [jnp.moveaxis(inverse[:, e], 0, 1) * scaled[:, e][:, None, None] for e in range(6)]
+            forces = -fold(jnp.add, parts)
         else:
             one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
             forces = jax.lax.map(one, (grasps.vertex_halves, scaled))

@@ -1,17 +1,17 @@
 """All formulations of the paper side by side, and forces for disturbances that are given outright, (6) and (9)-(10)."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxgrasp.arrays import literal
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.records import record
 from jaxgrasp.robustness.answers import FormulationSolution
 from jaxgrasp.robustness.chain import FORMULATIONS
 from jaxgrasp.robustness.formulations import Chain, check_vertices, formulation_margin, tile_of
@@ -32,8 +32,7 @@ STEPS = {
 }
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Binding:
     """Which constraint decides a margin: the one with the largest multiplier, forces in units of their bounds."""
 
@@ -45,8 +44,7 @@ class Binding:
     """Facets 0 .. n_e - 1, then the bound on the force; with exact cones 0 for friction and 1 for the bound."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Comparison:
     """Every formulation on the same grasps, in dictionaries.
 
@@ -67,6 +65,7 @@ class Comparison:
     the same bound are not negative; NaN where one of the two has no answer."""
 
 
+@own_settings()
 def compare_formulations(
     contacts: Contacts,
     disturbances: DisturbanceSet,
@@ -131,7 +130,7 @@ def _binding(contacts: Contacts, reduced: Solution, unreduced: FormulationSoluti
     z = jnp.concatenate(
         [reduced.cone_multipliers * (friction * bound)[..., None], (reduced.bound_multipliers * bound)[..., None]], -1
     )
-    flat = z.reshape(*z.shape[:-2], -1)
+    flat = z.reshape(*z.shape[:-2], z.shape[-2] * z.shape[-1])
     where = jnp.argmax(flat, -1)
     contact, row = where // z.shape[-1], where % z.shape[-1]
     facets = literal(pyramid_facets(cone_edges), z.dtype)
@@ -148,8 +147,7 @@ def _binding(contacts: Contacts, reduced: Solution, unreduced: FormulationSoluti
     return Binding(direction=told(direction), contact=told(contact), row=told(row))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class SpecifiedDisturbances:
     """What `specified_disturbances` answers."""
 
@@ -163,6 +161,7 @@ class SpecifiedDisturbances:
     """SOLVED where there are such forces, INFEASIBLE where there are none; otherwise as for the margin."""
 
 
+@own_settings()
 def specified_disturbances(
     contacts: Contacts,
     disturbances: DisturbanceSet,

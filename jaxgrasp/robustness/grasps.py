@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.compiling import compiled
@@ -101,6 +102,7 @@ def over_grasps(
     """
     if not isinstance(contacts, Contacts):
         raise ValueError(f"contacts: got {type(contacts).__name__}, wanted jaxgrasp.Contacts")
+    contacts.check_precision()
     if not isinstance(disturbances, DisturbanceSet):
         raise ValueError(f"disturbances: got {type(disturbances).__name__}, wanted jaxgrasp.DisturbanceSet")
     given = {
@@ -189,12 +191,13 @@ def admitted(arguments: Arguments, raw: dict[str, jax.Array]) -> Grasps:
         valid &= (smoothing > 0) & jnp.isfinite(smoothing)
         smoothing = jnp.where(valid, smoothing, 1)
 
+    # A choice of units: nothing that is reported in newtons and metres depends on it.
+    length, usable = _length(positions, active & valid, raw["wrench"], extents)
+    valid &= usable
+    length = jnp.where(valid, length, 1)
     there = active & valid
     positions = jnp.where(there, jnp.moveaxis(positions, 1, 0), 0)
     frames = jnp.where(there, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
-    mean = fold(jnp.add, fold(jnp.add, positions**2)) / jnp.maximum(fold(jnp.add, there.astype(dtype)), 1)
-    # A choice of units: nothing that is reported in newtons and metres depends on it.
-    length = jax.lax.stop_gradient(jnp.sqrt(jnp.where(mean > 0, mean, 1)))
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, raw["wrench"], 0)
     friction, max_force = jnp.where(there, raw["friction"], 1), jnp.where(there, raw["max_force"], 1)
@@ -236,6 +239,23 @@ def _lined(positions: jax.Array, there: jax.Array) -> jax.Array:
         far = jnp.where(further, apart[:, i], far)
     along = [apart[a] * far[(a + 1) % 3] == apart[(a + 1) % 3] * far[a] for a in range(3)]
     return fold(jnp.logical_and, [row.all(0) for row in along])
+
+
+def _length(
+    positions: jax.Array, there: jax.Array, wrench: jax.Array, extents: tuple[jax.Array, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """The root-mean-square distance of contacts (n, 3, *lanes), 1 where zero, and whether moments can be told in it."""
+    own = lax.stop_gradient(jnp.where(there, jnp.moveaxis(positions, 1, 0), 0))
+    # In units of the largest, whose square may be more, or less, than there are numbers for.
+    largest = fold(jnp.maximum, fold(jnp.maximum, jnp.abs(own)))
+    largest = jnp.where(largest > 0, largest, 1)
+    count = jnp.maximum(fold(jnp.add, there.astype(own.dtype)), 1)
+    mean = fold(jnp.add, fold(jnp.add, (own / largest) ** 2)) / count
+    length = largest * jnp.sqrt(jnp.where(mean > 0, mean, 1))
+    usable = jnp.isfinite(length) & jnp.isfinite(1 / length)
+    for moment in (wrench, *extents):
+        usable &= jnp.isfinite(lax.stop_gradient(moment[3:]) / length).all(0)
+    return length, usable
 
 
 def _sound_actuation(raw: dict[str, jax.Array], active: jax.Array) -> jax.Array:

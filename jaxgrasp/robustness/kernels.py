@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.solvers.lanes import map_lanes
 from jaxgrasp.solvers.linear_lanes import linear_lanes, transposed_lanes
 
@@ -181,6 +182,7 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()
         )
 
     @partial(value.defjvp, symbolic_zeros=True)
+    @own_settings()
     def derivative(primals: tuple, dots: tuple) -> tuple[Tree, Tree]:
         arguments, held = primals
         out = value(arguments, held)

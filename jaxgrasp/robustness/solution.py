@@ -1,16 +1,13 @@
 """What (21) and (22) answer."""
 
-from dataclasses import dataclass
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxgrasp.contact.contacts import Contacts
+from jaxgrasp.records import record
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class Solution:
     """Tightening forces of a batch of grasps, with what certifies them."""
 

@@ -12,6 +12,7 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.records import record
 from jaxgrasp.robustness.answers import Verdict, programs, solved_program, verdict
 from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited, hidden
@@ -49,8 +50,7 @@ _ACCEPTED = {"float64": 1e-7, "float32": 1e-3}
 _NOTHING = {"float64": 1e-8, "float32": 1e-5}
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class TotalEffortSolution:
     """What `least_total_effort` answers."""
 

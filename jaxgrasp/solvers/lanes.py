@@ -6,7 +6,6 @@ Elsewhere they go at once, on GPUs as native code where that is asked for. A ker
 one for each of several programs of a lane.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +14,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from jaxgrasp.fence import fences
 from jaxgrasp.kernels import fused, usable
+from jaxgrasp.solvers.independent import independent, on_one_device
 
 Tree = Any
 # Values of all rows of a tile: its working set has to fit in the second-level cache, and XLA's CPU backend would cut
@@ -29,6 +28,8 @@ LOOSE_TILE = 1024
 # The same of what a tile is given: half a megabyte.
 LARGEST_LEAF = 1 << 15
 LARGE_TILE = 1 << 17
+# Of batches of any size, small ones among them.
+SMALL_TILE = 64
 
 
 @dataclass(frozen=True)
@@ -111,55 +112,48 @@ def _of_programs(function: Callable[[Tree], Tree], programs: Tree, tile: int, kn
 def _run(
     stages: tuple[Callable, ...], structure: Any, shared: tuple[bool, ...], rows: int, tile: int, known_as: str | None
 ) -> Callable:
-    @custom_vmap
-    def run(leaves: list[jax.Array]) -> Tree:
-        return tiled(stages, structure, shared, rows, leaves, tile, known_as)
+    work = partial(tiled, stages, structure, rows, tile, known_as)
 
-    @run.def_vmap
-    def mapped(size: int, batched: list, leaves: list[jax.Array]) -> tuple[Tree, Tree]:
-        merged, still_shared, lanes = merged_axes(leaves, batched[0], shared, size)
-        out = _run(stages, structure, still_shared, rows, tile, known_as)(merged)
-        out = jax.tree.map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
+    def run(leaves: list[jax.Array]) -> Tree:
+        out = _outline(work, leaves, shared, known_as)
+        wanted, structure = jax.tree.flatten(out)
+        flat = lambda *args: jax.tree.leaves(work(*args))  # noqa: E731
+        events = tuple((x.shape[1:], x.dtype) for x in wanted)
+        return jax.tree.unflatten(structure, independent(flat, leaves, shared, events))
 
     return run
 
 
-def merged_axes(
-    leaves: list[jax.Array], mapped: Sequence[bool], shared: Sequence[bool], size: int
-) -> tuple[list[jax.Array], tuple[bool, ...], int]:
-    """Leaves with a leading mapped axis made part of the lanes, what is then still shared, and the lanes before.
+_outlines: dict[Any, Tree] = {}
 
-    Args:
-        leaves: with a leading axis of the given size where mapped, then the lanes where not shared.
-        mapped: for every leaf.
-        shared: for every leaf.
-        size: of the mapped axis.
-    """
-    lanes = next(x.shape[1 if m else 0] for x, m, s in zip(leaves, mapped, shared, strict=True) if not s)
-    merged = []
-    for leaf, is_mapped, is_shared in zip(leaves, mapped, shared, strict=True):
-        if is_shared and not is_mapped:
-            merged.append(leaf)
-            continue
-        if is_shared:
-            leaf = jnp.broadcast_to(leaf[:, None], (size, lanes, *leaf.shape[1:]))
-        elif not is_mapped:
-            leaf = jnp.broadcast_to(leaf, (size, *leaf.shape))
-        merged.append(leaf.reshape(size * lanes, *leaf.shape[2:]))
-    return merged, tuple(s and not m for s, m in zip(shared, mapped, strict=True)), lanes
+
+def _outline(work: Callable, leaves: list[jax.Array], shared: tuple[bool, ...], known_as: str | None) -> Tree:
+    """Arrays like the results for one lane, traced once for what is known by its name."""
+    given = [
+        jax.ShapeDtypeStruct(x.shape if s else (1, *x.shape[1:]), x.dtype) for x, s in zip(leaves, shared, strict=True)
+    ]
+    key = known_as, tuple((x.shape, x.dtype) for x in given), shared, jax.config.read("jax_enable_x64")
+    if known_as is None or key not in _outlines:
+        platform = "cpu" if jax.default_backend() == "cpu" else "other"
+        with on_one_device():
+            out = jax.eval_shape(lambda leaves: work(leaves, shared, platform), given)
+        if known_as is None:
+            return out
+        _outlines[key] = out
+    return _outlines[key]
 
 
 def tiled(
     stages: tuple[Callable, ...],
     structure: Any,
-    shared: tuple[bool, ...],
     rows: int,
+    loose: int,
+    known_as: str | None,
     leaves: list[jax.Array],
-    loose: int = LOOSE_TILE,
-    known_as: str | None = None,
+    shared: tuple[bool, ...],
+    platform: str,
 ) -> Tree:
-    """`map_lanes` of leaves, without a rule for `jax.vmap`; rows are 0 where tiles cannot be compact."""
+    """The stages in turn on one device, in tiles; see `map_lanes`. Rows are 0 where tiles cannot be compact."""
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
     first = lambda last: stages[0](jax.tree.unflatten(structure, last))  # noqa: E731
 
@@ -177,7 +171,7 @@ def tiled(
         return _in_turn(steps, value)
 
     def in_tiles(leaves: list[jax.Array], tile: int, one: Callable) -> Tree:
-        count = math.ceil(lanes / tile)
+        count = -(-lanes // tile)
         own = [x for x, s in zip(leaves, shared, strict=True) if not s]
         own = [jnp.pad(x, [(0, count * tile - lanes)] + [(0, 0)] * (x.ndim - 1)) for x in own]
 
@@ -191,15 +185,9 @@ def tiled(
             out = lax.map(body, [x.reshape(count, tile, *x.shape[1:]) for x in own])
         return jax.tree.map(lambda x: x.reshape(count * tile, *x.shape[2:])[:lanes], out)
 
-    whole = partial(_in_turn, (first, *stages[1:]))
-
-    def on_cpu() -> Tree:
-        return fused(whole, leaves, shared, in_compact_tiles, known_as)
-
-    def on_gpu() -> Tree:
-        return fused(whole, leaves, shared, at_once, known_as, "cuda")
-
     def in_compact_tiles(leaves: list[jax.Array]) -> Tree:
+        # XLA aborts where it finds more than 10 kB of constants in a tile that is one function.
+        leaves = lax.optimization_barrier(leaves)
         size = min(1 << max(0, (TILE // max(rows, 1)).bit_length() - 1), 64)
         largest = max(size * x.size // x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
         compact = rows > 0 and lanes > size and largest <= LARGEST_LEAF
@@ -219,10 +207,19 @@ def tiled(
     def at_once(leaves: list[jax.Array]) -> Tree:
         return in_tiles(leaves, min(LARGE_TILE, lanes), solve)
 
-    if jax.default_backend() == "cpu":
-        return on_cpu()
-    native = {"cpu": on_cpu, "cuda": on_gpu} if usable("cuda") else {"cpu": on_cpu}
-    return lax.platform_dependent(**native, default=lambda: at_once(leaves))
+    def in_small_tiles(leaves: list[jax.Array]) -> Tree:
+        with fences(platform == "cpu"):
+            return in_tiles(leaves, SMALL_TILE, solve)
+
+    if not isinstance(lanes, int):
+        # How many there are is known when the program runs.
+        return in_small_tiles(leaves)
+    whole = partial(_in_turn, (first, *stages[1:]))
+    if platform == "cpu":
+        return fused(whole, leaves, shared, in_compact_tiles, known_as)
+    if platform == "cuda" and usable("cuda"):
+        return fused(whole, leaves, shared, at_once, known_as, "cuda")
+    return at_once(leaves)
 
 
 def _in_turn(steps: Sequence[Callable[[Tree], Tree]], value: Tree) -> Tree:

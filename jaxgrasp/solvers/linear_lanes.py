@@ -20,9 +20,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, xla
 
-from jaxgrasp.solvers.lanes import merged_axes, tiled
+from jaxgrasp.compiling import own_settings
+from jaxgrasp.solvers.independent import alike, independent, merged_axes, types
+from jaxgrasp.solvers.lanes import LOOSE_TILE, tiled
 
 Tree = Any
 Kernel = Callable[[list[jax.Array], list[jax.Array]], list[jax.Array]]
@@ -111,7 +113,8 @@ _linear_lanes_p.multiple_results = True
 
 
 def _bind(spec: _Map, data: list, tangents: list) -> list:
-    return _linear_lanes_p.bind(*data, *tangents, spec=spec)
+    args = [*data, *tangents]
+    return _linear_lanes_p.bind(*alike(args, _shared(spec, len(args))), spec=spec)
 
 
 def _split(spec: _Map, args: Any) -> tuple[list, list]:
@@ -120,23 +123,25 @@ def _split(spec: _Map, args: Any) -> tuple[list, list]:
 
 def _run(*args: jax.Array, spec: _Map) -> list[jax.Array]:
     tangents = _split(spec, args)[1]
-    if not tangents[0].shape[0]:
+    if tangents[0].shape[0] == 0:
         return [jnp.zeros((0, *shape), dtype) for shape, dtype in spec.outputs]
-    shared = spec.shared + (False,) * len(tangents)
     stage = lambda leaves: spec.kernel(*_split(spec, leaves))  # noqa: E731
-    return tiled((stage,), jax.tree.structure(list(args)), shared, spec.rows if spec.adjoint is None else 0, list(args))
+    rows = spec.rows if spec.adjoint is None else 0
+    work = partial(tiled, (stage,), jax.tree.structure(list(args)), rows, LOOSE_TILE, None)
+    return independent(work, args, _shared(spec, len(args)), spec.outputs)
 
 
-_linear_lanes_p.def_impl(lambda *args, spec: jax.jit(partial(_run, spec=spec))(*args))
+_linear_lanes_p.def_impl(partial(xla.apply_primitive, _linear_lanes_p))
 mlir.register_lowering(_linear_lanes_p, mlir.lower_fun(_run, multiple_results=True))
+_linear_lanes_p.def_abstract_eval(lambda *avals, spec: types(avals, _shared(spec, len(avals)), spec.outputs))
 
 
-@_linear_lanes_p.def_abstract_eval
-def _shapes(*args: Any, spec: _Map) -> list:
-    lanes = _split(spec, args)[1][0].shape[0]
-    return [jax.core.ShapedArray((lanes, *shape), dtype) for shape, dtype in spec.outputs]
+def _shared(spec: _Map, count: int) -> tuple[bool, ...]:
+    """Of all arguments."""
+    return spec.shared + (False,) * (count - len(spec.shared))
 
 
+@own_settings()
 def _jvp(primals: Any, dots: Any, *, spec: _Map) -> tuple[list, list]:
     data, tangents = _split(spec, primals)
     data_dots, tangent_dots = _split(spec, dots)
@@ -201,12 +206,9 @@ def _transpose(cotangents: Any, *args: Any, spec: _Map) -> list:
 
 
 def _batch(args: Any, dims: Any, *, spec: _Map) -> tuple[list, list]:
-    size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
-    mapped = [d is not None for d in dims]
-    front = [jnp.moveaxis(x, d, 0) if m else x for x, d, m in zip(args, dims, mapped, strict=True)]
-    shared = spec.shared + (False,) * (len(args) - len(spec.shared))
-    merged, still, lanes = merged_axes(front, mapped, shared, size)
-    out = _linear_lanes_p.bind(*merged, spec=spec._replace(shared=still[: len(spec.shared)]))
+    merged, still, size, lanes = merged_axes(args, dims, _shared(spec, len(args)))
+    count = len(spec.shared)
+    out = _bind(spec._replace(shared=still[:count]), merged[:count], merged[count:])
     return [x.reshape(size, lanes, *x.shape[1:]) for x in out], [0] * len(out)
 
 

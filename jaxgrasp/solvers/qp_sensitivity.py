@@ -26,7 +26,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxgrasp.compiling import own_settings
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program
+from jaxgrasp.solvers.independent import one_lane
 from jaxgrasp.solvers.interior_point import Iterate
 
 # s z is raised to this, so that rows that are only just active, with s and z both zero, keep a finite weight.
@@ -49,6 +51,7 @@ def solution_of(program: Program, point: Iterate, solved: jax.Array) -> Iterate:
 
 
 @solution_of.defjvp
+@own_settings()
 def _solution_jvp(primals: tuple, tangents: tuple) -> tuple[Iterate, Iterate]:
     program, _, solved = primals
     # Once more as a function of the program, for derivatives of the derivatives.
@@ -58,7 +61,8 @@ def _solution_jvp(primals: tuple, tangents: tuple) -> tuple[Iterate, Iterate]:
     x, y, s, z = safe = _or(solved, point, Iterate(0.0, 0.0, 1.0, 1.0))
     ratio = _ratio(safe)
     kkt = Embedding(lax.stop_gradient(program), CONSTANTS[x.dtype.name])
-    factors = kkt.reduce(lax.stop_gradient(1 / ratio))
+    factor = lambda _, program, weights: Embedding(program, kkt.constants).reduce(weights)  # noqa: E731
+    factors = one_lane(factor, solved, kkt.program, lax.stop_gradient(1 / ratio))
     parts = lambda v: jnp.split(v, [x.size, x.size + y.size])  # noqa: E731
 
     def matrix(v: jax.Array) -> jax.Array:
@@ -79,6 +83,7 @@ def value_at(program: Program, point: Iterate, value: jax.Array, solved: jax.Arr
 
 
 @value_at.defjvp
+@own_settings()
 def _value_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
     _, point, value, solved = primals
     dP, dq, dA, db, dG, dh = tangents[0]

@@ -1,7 +1,8 @@
 """Quadratic and linear programs of any small dense data, in batch, with certificates where there is no solution."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,11 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from jaxgrasp.arrays import as_float, broadcast_batch
+from jaxgrasp.compiling import compiled
+from jaxgrasp.records import record
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program, largest
+from jaxgrasp.solvers.independent import one_lane
 from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.qp_sensitivity import solution_of, value_at
 from jaxgrasp.solvers.status import Status
@@ -25,8 +29,7 @@ _FAR = 1e3
 _INFINITE = 1e20
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
+@record
 class QPSolution:
     """What `solve_qp` found; every field has the leading axes of the batch.
 
@@ -78,7 +81,7 @@ def _equilibrated(program: Program) -> tuple[Program, Iterate]:
         largest = jnp.max(jnp.abs(matrix) * scale * scale[:, None], 1)
         return scale / jnp.sqrt(jnp.where(largest > 0, largest, 1))
 
-    scale = lax.fori_loop(0, _EQUILIBRATIONS, equilibrate, jnp.ones(n + p + m, P.dtype))
+    scale = lax.fori_loop(0, _EQUILIBRATIONS, equilibrate, jnp.ones_like(matrix, shape=n + p + m))
     d, e, f = scale[:n], scale[n : n + p], scale[n + p :]
     # A side that is far away, like 1e12 for none, says nothing about the size of x, and residuals are measured by the
     # sides: its row is divided until it is no longer far.
@@ -113,7 +116,8 @@ def _solve_one(program: Program) -> QPSolution:
     settings = Settings(
         constants.tolerance, _MAX_ITERATIONS, constants.step_cap, constants.mu_floor, True, 0.0, _PATIENCE
     )
-    outcome = interior_point.solve(Embedding(lax.stop_gradient(scaled), constants), settings, valid & ~impossible)
+    loop = lambda valid, scaled: interior_point.solve(Embedding(scaled, constants), settings, valid)  # noqa: E731
+    outcome = one_lane(loop, valid & ~impossible, lax.stop_gradient(scaled))
     record, iterate = outcome.record, outcome.record.iterate
     found = jnp.where(record.error <= constants.accept, record.shows, int(Status.MAX_ITERATIONS))
     status = jnp.where(valid, jnp.where(impossible, int(Status.INFEASIBLE), found), int(Status.INVALID_INPUT))
@@ -232,9 +236,13 @@ def solve_qp(
         .astype(dtype)
         for v, k, alone in zip(program, events, shared, strict=True)
     ]
+    return _solve_lanes(tuple(shared), batch, Program(*lanes))
+
+
+@partial(compiled, static_argnums=(0, 1))
+def _solve_lanes(shared: tuple[bool, ...], batch: tuple[int, ...], lanes: Program) -> QPSolution:
     solve = jax.vmap(lambda *data: _solve_one(Program(*data)), in_axes=tuple(None if alone else 0 for alone in shared))
-    solution = solve(*lanes)
-    return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solution)
+    return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solve(*lanes))
 
 
 def _pair(

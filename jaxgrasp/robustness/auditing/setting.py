@@ -1,11 +1,12 @@
 """How answers are audited, and what follows when one of them fails."""
 
 import contextlib
-import contextvars
 import itertools
 import os
 import warnings
 from collections.abc import Iterator
+
+import jax
 
 from jaxgrasp import kernels
 
@@ -14,7 +15,8 @@ FORMS = ("sampled", "strict", "off")
 # The default form recomputes S_1 and S_2 for one lane in this many, another one at every call.
 STRIDE = 16
 
-_form: contextvars.ContextVar[str | None] = contextvars.ContextVar("form", default=None)
+# A context of JAX's, so that programs are traced anew where it changes.
+_form = jax.make_user_context(None)
 _turns = itertools.count()
 _warned = False
 
@@ -25,8 +27,7 @@ def audit(form: str) -> Iterator[None]:
 
     Every form but "off" checks each answer against the public arguments in plain XLA code: G f = b, the cone and bound
     rows at the claimed margin, the upper bound by its multipliers, and lower <= upper. An answer that does not pass
-    gets `Status.NOT_VERIFIED`. Inside a function of your own under `jax.jit` the form counts that is chosen while it is
-    traced. The environment variable JAXGRASP_AUDIT chooses for the whole process.
+    gets `Status.NOT_VERIFIED`. The environment variable JAXGRASP_AUDIT chooses for the whole process.
 
     Args:
         form: "sampled", the default: every lane with the S_1 and S_2 that its solver used, and one lane in sixteen,
@@ -36,16 +37,13 @@ def audit(form: str) -> Iterator[None]:
     Raises:
         ValueError: another form.
     """
-    token = _form.set(_known("form", form))
-    try:
+    with _form(_known("form", form)):
         yield
-    finally:
-        _form.reset(token)
 
 
 def chosen_form() -> str:
     """The form that counts now."""
-    return _form.get() or _known(SETTING, os.environ.get(SETTING, FORMS[0]))
+    return _form.value or _known(SETTING, os.environ.get(SETTING, FORMS[0]))
 
 
 def next_turn() -> int:
