@@ -6,6 +6,11 @@ import mujoco
 import numpy as np
 
 
+def one_line(error: BaseException) -> str:
+    """What an error says, in one line."""
+    return " ".join(str(error).split())
+
+
 def read_model(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
     """The model of a file or a specification.
 
@@ -18,7 +23,7 @@ def read_model(scene: str | PathLike | mujoco.MjSpec | mujoco.MjModel) -> mujoco
         return scene.compile() if isinstance(scene, mujoco.MjSpec) else mujoco.MjModel.from_xml_path(str(scene))
     except ValueError as error:
         name = "the specification" if isinstance(scene, mujoco.MjSpec) else scene
-        raise ValueError(f"scene: {name} cannot be read: {' '.join(str(error).split())}") from error
+        raise ValueError(f"scene: {name} cannot be read: {one_line(error)}") from error
 
 
 def body_named(model: mujoco.MjModel, argument: str, name: str) -> int:
