@@ -46,3 +46,40 @@ def bodies_below(model: mujoco.MjModel, body: int) -> np.ndarray:
         if int(model.body_parentid[other]) in inside:
             inside.add(other)
     return np.array(sorted(inside))
+
+
+def hand_bodies(model: mujoco.MjModel, object: np.ndarray) -> np.ndarray:
+    """The bodies of the hand where none is named: what its joints move, its root, and what is fixed to these.
+
+    The root is the last body that all of the hand's hinges and slides hang on, or, where they hang on several bodies of
+    the world, each of these. A body that is neither the object's nor the hand's, a table for example, is environment:
+    it is no finger. In a scene without hinges and slides every body that is not the object's is the hand's.
+
+    Args:
+        model: The scene.
+        object: Bodies of the object.
+    """
+    others = np.setdiff1d(np.arange(1, model.nbody), object)
+    jointed = np.isin(model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)))
+    jointed = np.setdiff1d(model.jnt_bodyid[jointed], object)
+    if not len(jointed):
+        return others
+    chains = [_chain(model, int(model.body_parentid[body])) for body in jointed]
+    shared = [body for body in chains[0] if all(body in chain for chain in chains)]
+    if shared:
+        above = _chain(model, shared[0])
+        free = [body for body in above if model.jnt_bodyid[model.jnt_type == 0].tolist().count(body)]
+        inside = np.union1d(bodies_below(model, free[-1] if free else shared[0]), above)
+    else:
+        tops = {_chain(model, int(body))[-1] for body in jointed}
+        inside = np.concatenate([bodies_below(model, top) for top in tops])
+    return np.intersect1d(inside, others)
+
+
+def _chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """The body and those above it, without the world."""
+    chain = []
+    while body:
+        chain.append(body)
+        body = int(model.body_parentid[body])
+    return chain

@@ -65,9 +65,7 @@ def add_object(
             geom.density = _WATER * mass / whole
 
 
-def _add_geoms(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, object: str | PathLike, scale: float
-) -> list[mujoco.MjsGeom]:
+def _add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, object: str | PathLike, scale: float) -> list[mujoco.MjsGeom]:
     """Geoms of a primitive or of meshes, every one by its convex hull."""
     if str(object) in PRIMITIVES:
         kind, size = PRIMITIVES[str(object)]
