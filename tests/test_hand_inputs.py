@@ -147,7 +147,9 @@ def test_a_link_has_one_contact_at_the_mean_of_its_points(engine):
             qpos, engine
         ),
     )
-    merged = jax.tree.map(np.asarray, HandObject.from_mjcf(hand.model, "object", contact_distance=2e-3).grasps(qpos, engine))
+    merged = jax.tree.map(
+        np.asarray, HandObject.from_mjcf(hand.model, "object", contact_distance=2e-3).grasps(qpos, engine)
+    )
     assert merged.distances.shape[1] == 4 and not merged.left_out.any()
     several = 0
     for lane, slot in zip(*np.nonzero(merged.contacts.active), strict=True):

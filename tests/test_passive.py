@@ -12,6 +12,8 @@ from jaxgrasp.hands import HandObject
 PUSHES = jg.DisturbanceSet.forces(1.0)
 OPTION = '<option cone="elliptic" impratio="100" timestep="0.001" gravity="0 0 {gravity}"/>'
 
+STIFF = 'solref="0.002 1" solimp="0.99 0.99 0.001"'
+
 
 def four_pads(joint="", tendon="", rest="", pad="", cube="", gravity=-9.81, actuators=4, slide=True, more="") -> str:
     """Four pads on slides, 2 cm in, that touch the sides of a cube of 6 cm and 0.1 kg."""
@@ -21,13 +23,13 @@ def four_pads(joint="", tendon="", rest="", pad="", cube="", gravity=-9.81, actu
         at = 0.065 if slide else 0.045
         pads += (
             f'<body name="f{k}" pos="{at * x} {at * y} 0" gravcomp="1">{joints}'
-            f'<geom name="g{k}" type="sphere" size="0.015" mass="0.05" {pad}/></body>'
+            f'<geom name="g{k}" type="sphere" size="0.015" mass="0.05" {STIFF} {pad}/></body>'
         )
         motors += f'<motor name="m{k}" joint="j{k}" ctrlrange="-5 5"/>' if k < actuators and slide else ""
         tendons += f'<fixed name="t{k}" {tendon}><joint joint="j{k}" coef="1"/></fixed>' if tendon else ""
     return (
         f'<mujoco>{OPTION.format(gravity=gravity)}<worldbody>{more}{pads}<body name="object"><freejoint/>'
-        f'<geom name="cube" type="box" size="0.03 0.03 0.03" mass="0.1" {cube}/></body></worldbody>'
+        f'<geom name="cube" type="box" size="0.03 0.03 0.03" mass="0.1" {STIFF} {cube}/></body></worldbody>'
         f"<tendon>{tendons}</tendon><actuator>{motors}</actuator>{rest}</mujoco>"
     )
 
@@ -56,7 +58,7 @@ def pressed(xml: str, command: float) -> np.ndarray:
     mujoco.mj_step(model, data, 2000)
     for k in range(data.ncon):
         mujoco.mj_contactForce(model, data, k, force)
-        found[max(model.geom_bodyid[data.contact.geom[k]].tolist(), key=lambda b: model.body(b).name) - 1] += force[0]
+        found[min(model.geom_bodyid[data.contact.geom[k]].tolist()) - 1] += force[0]
     return found
 
 
@@ -138,10 +140,11 @@ def test_only_springs_decide(joint, holds):
 @pytest.mark.parametrize(("friction", "holds"), [("1", True), ("0.1", False)])
 def test_only_dry_friction_decides(friction, holds):
     """One motor presses a cube against a pad that nothing but dry friction keeps from giving way."""
-    xml = wedge(f'frictionloss="{friction}"')
+    # Softer, MuJoCo's friction creeps.
+    xml = wedge(f'frictionloss="{friction}" solimpfriction="0.9999 0.9999 0.001"')
     found = ranked(xml, weight=False, pushes=SIDEWAYS, unreached="free")[-1]
     assert (found.status == jg.Status.SOLVED and found.margin > 0.1) == holds
-    assert stays(xml, 0.8 if holds else 0.8) == holds
+    assert stays(xml, 0.8) == holds
 
 
 @pytest.mark.parametrize(("limit", "holds"), [('range="-0.02 0.02" limited="true"', True), ("", False)])
@@ -239,7 +242,8 @@ def test_many_points_of_one_finger_keep_no_other_finger_out():
     jaws = ""
     for name, y in (("left", 1), ("right", -1)):
         boxes = "".join(
-            f'<geom type="box" size="0.011 0.01 0.0093" pos="0 0 {z}" mass="0.02" friction="0.7"/>' for z in (0.01, -0.01)
+            f'<geom type="box" size="0.011 0.01 0.0093" pos="0 0 {z}" mass="0.02" friction="0.7"/>'
+            for z in (0.01, -0.01)
         )
         jaws += f'<body name="{name}" pos="0 {0.04 * y} 0"><joint name="{name}" type="slide" axis="0 {-y} 0"/>{boxes}</body>'
     servos = "".join(
@@ -283,7 +287,10 @@ CLUTTER = '<body name="mug" pos="0 0 0.2"><freejoint/><geom size="0.02"/></body>
         (CLUTTER + TABLE + PALM, {"palm", "finger"}),
         (f'<body name="room">{TABLE}{PALM}</body>', {"room", "palm", "finger"}),
         (TABLE + FREE.format(PALM), {"base", "wrist", "palm", "finger"}),
-        (TABLE + PALM.replace("palm", "a").replace("finger", "b").replace('"j"', '"k"') + PALM, {"a", "b", "palm", "finger"}),
+        (
+            TABLE + PALM.replace("palm", "a").replace("finger", "b").replace('"j"', '"k"') + PALM,
+            {"a", "b", "palm", "finger"},
+        ),
         (TABLE, {"table"}),
     ],
 )

@@ -2,15 +2,16 @@
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.problems import CommandError, check_output, write_files
+from jaxgrasp.cli.scene import ComparedScene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 
 if TYPE_CHECKING:
@@ -33,13 +34,13 @@ DEFAULT = (
 class Compare:
     """Compare metrics on the same grasps: how alike they rank them, and how well they predict success.
 
-    Reads the files that `jaxgrasp rank` reads, computes metrics, and writes a table and a figure of Spearman's rank
+    Reads the files that `jaxgrasp rank` reads, or takes a hand, an object and grasps as `rank` does, computes metrics, and writes a table and a figure of Spearman's rank
     correlations. Where the files have a column that says which grasps succeeded, ROC curves and the areas under them
     come along, with 95 % bootstrap intervals. A grasp without an answer counts as the worst.
     """
 
-    files: tyro.conf.Positional[tuple[Path, ...]]
-    """Files of candidates, .npz."""
+    files: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Files of candidates, .npz; none with a hand."""
 
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Metrics to compare, NAME[,NAME...]; all that take batches without any. A wrong name is answered with all
@@ -50,7 +51,7 @@ class Compare:
 
     success: str | None = None
     """The column that says which grasps succeeded, of booleans or of 0 and 1. None takes a boolean one whose name has
-    "success" in it, where there is one."""
+    "succ" in it, where there is one."""
 
     within: str | None = None
     """A column of labels, object_name for example: areas then count only pairs of grasps with the same label, so that
@@ -83,6 +84,8 @@ class Compare:
     figure: Path | None = Path("comparison.png")
     """The figure to write, .png, .svg or .pdf; None for no figure."""
 
+    of_hand: Annotated[ComparedScene, tyro.conf.arg(name="")] = field(default_factory=ComparedScene)
+
     def run(self) -> int:
         """Computes, writes and prints.
 
@@ -105,9 +108,12 @@ class Compare:
 
         try:
             disturbances, _ = named_disturbances(self.disturbances)
-            candidates = read_candidates(
-                self.files, friction=self.friction, max_force=self.max_force, with_mass=self.gravity != 0.0
-            )
+            if self.of_hand.given:
+                candidates, _ = self.of_hand.candidates(self.friction, self.max_force)
+            else:
+                candidates = read_candidates(
+                    self.files, friction=self.friction, max_force=self.max_force, with_mass=self.gravity != 0.0
+                )
         except CandidateError as error:
             raise CommandError(str(error)) from error
         outcome, success = self._success(candidates)
@@ -138,12 +144,15 @@ class Compare:
             ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
             ("--resamples", self.resamples, self.resamples >= 1, "at least 1"),
             ("--seed", self.seed, self.seed >= 0, "a number >= 0"),
-            ("FILES", "none", bool(self.files), "at least one file of candidates"),
+            ("FILES", "none", bool(self.files) or self.of_hand.given, "at least one file of candidates, or a hand"),
         ]
         for option, value, admissible, wanted in checks:
             if not admissible:
                 raise CommandError(f"{option}: got {value}; wanted {wanted}")
-        inputs = [*self.files, Path(self.disturbances)]
+        self.of_hand.check()
+        if self.of_hand.given and (self.files or self.gravity):
+            raise CommandError("--hand or --scene: got FILES or --gravity, too; wanted the scene's own alone")
+        inputs = [*self.files, Path(self.disturbances), Path(self.of_hand.name), *self.of_hand.grasps]
         for option, path, endings in (("--output", self.output, (".csv",)), ("--figure", self.figure, FIGURE_ENDINGS)):
             if path is not None:
                 check_output(path, option, endings, inputs)
@@ -154,7 +163,7 @@ class Compare:
             fitting = [
                 key
                 for key, column in candidates.columns.items()
-                if "success" in key and column.dtype == bool and column.ndim == 1
+                if "succ" in key and column.dtype == bool and column.ndim == 1
             ]
             if not fitting:
                 return "success", None

@@ -29,8 +29,8 @@ class Rank:
 
     Reads .npz files with positions (N, n_c, 3), in m about the centre of mass, and outward_normals (N, n_c, 3) or
     frames (N, n_c, 3, 3), and where present friction, max_force, mass, center_of_mass and active; other columns travel
-    along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object. With --scene the
-    candidates are configurations of a hand.
+    along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object. With --scene, or
+    with --hand, --object and --grasps, the candidates are configurations of a hand.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -90,14 +90,17 @@ class Rank:
         configure_jax()
         from jaxgrasp.candidates import CandidateError
 
-        hand = self.of_hand.hand(self.friction, self.max_force) if self.of_hand.scene else None
+        hands: list[HandObject] = []
         try:
             disturbances, unit = named_disturbances(self.disturbances)
-            candidates = self._candidates() if hand is None else self.of_hand.candidates(hand)
+            if self.of_hand.given:
+                candidates, hands = self.of_hand.candidates(self.friction, self.max_force)
+            else:
+                candidates = self._candidates()
         except CandidateError as error:
             raise CommandError(str(error)) from error
         metrics = scores_of(candidates, names, disturbances, gravity=self.gravity, cone_edges=self.cone_edges)
-        return self._rank(candidates, disturbances, unit, hand, metrics)
+        return self._rank(candidates, disturbances, unit, hands, metrics)
 
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
@@ -113,14 +116,21 @@ class Rank:
         if self.prune and self.metric:
             raise CommandError("--prune: got --metric, too; wanted a ranking by the margin alone")
         self.of_hand.check()
-        if self.of_hand.scene and (self.files or self.gravity):
+        if self.of_hand.given and (self.files or self.gravity):
             what = "files of contacts" if self.files else "--gravity"
-            raise CommandError(f"--scene: got {what}, too; wanted the scene's own contacts and gravity alone")
-        inputs = [*self.files, Path(self.disturbances), Path(self.of_hand.scene or ""), self.of_hand.qpos or Path()]
+            option = "--scene" if self.of_hand.scene else "--hand"
+            raise CommandError(f"{option}: got {what}, too; wanted the scene's own contacts and gravity alone")
+        inputs = [
+            *self.files,
+            Path(self.disturbances),
+            Path(self.of_hand.name),
+            self.of_hand.qpos or Path(),
+            *self.of_hand.grasps,
+        ]
         for option, path, endings in (
             ("--output", self.output, TABLE_ENDINGS),
             ("--figure", self.figure, FIGURE_ENDINGS),
-            ("--picture", self.of_hand.picture if self.of_hand.scene else None, FIGURE_ENDINGS),
+            ("--picture", self.of_hand.picture if self.of_hand.given else None, FIGURE_ENDINGS),
         ):
             if path is not None:
                 check_output(path, option, endings, inputs)
@@ -143,7 +153,7 @@ class Rank:
         candidates: "Candidates",
         disturbances: "DisturbanceSet",
         unit: str,
-        hand: "HandObject | None",
+        hands: "list[HandObject]",
         metrics: dict[str, np.ndarray],
     ) -> int:
         from jaxgrasp.cli.report import Clock, print_ranking, progress_bar
@@ -171,11 +181,11 @@ class Rank:
             print(f"jaxgrasp: {what}: ranked {len(ranking.margin):,} of {len(candidates):,}", file=sys.stderr)
             if len(ranking.margin) == 0:
                 return exit_code
-        written, failed = self._write(ranking, unit, hand)
+        written, failed = self._write(ranking, unit, hands)
         print_ranking(ranking, unit, clock, written)
         return exit_code or (2 if failed else 0)
 
-    def _write(self, ranking: "Ranking", unit: str, hand: "HandObject | None") -> tuple[list[Path], bool]:
+    def _write(self, ranking: "Ranking", unit: str, hands: "list[HandObject]") -> tuple[list[Path], bool]:
         from jaxgrasp.ranking import write_table
         from jaxgrasp.viewer import figure_of_ranking, write_figure
 
@@ -185,8 +195,8 @@ class Rank:
         written, failed = write_files(
             (self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture)
         )
-        if hand is not None and np.isfinite(ranking.effort).any():
+        if hands and np.isfinite(ranking.effort).any():
             # Many machines have nothing to render with: that is told, and no failure.
-            drawn, _ = write_files((self.of_hand.picture, lambda path: self.of_hand.draw(hand, ranking, unit, path)))
+            drawn, _ = write_files((self.of_hand.picture, lambda path: self.of_hand.draw(hands, ranking, unit, path)))
             written += drawn
         return written, failed

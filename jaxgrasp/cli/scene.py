@@ -2,6 +2,7 @@
 
 import math
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,9 @@ import numpy as np
 from jaxgrasp.cli.problems import CommandError, check_options
 
 if TYPE_CHECKING:
+    from mujoco import MjModel, MjSpec
+
+    from jaxgrasp import hands
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.hands import HandObject
     from jaxgrasp.ranking import Ranking
@@ -18,6 +22,10 @@ if TYPE_CHECKING:
 BUILT_IN = ("shadow_hand", "four_fingers")
 SAMPLED = 2_000
 _PICTURES = 4
+# Options that a scene of a file answers itself.
+_OF_BUILT = ("mass", "density", "torsional_friction", "condim", "gravity_vector", "table")
+# Warnings that were printed: scenes of several scales have the same ones.
+_SAID: set[str] = set()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +41,51 @@ class HandScene:
     object_shape: str = "sphere"
     """The object of a scene that comes with the package: sphere, capsule, box, cylinder, ellipsoid, mesh, or a FILE."""
 
-    contact_distance: float = 1e-3
+    hand: str | None = None
+    """A hand of your own in place of --scene, with --object: an MJCF or URDF file, shadow_hand or four_fingers, or
+    FOLDER/FILE of a local copy of mujoco_menagerie."""
+
+    mass: float | None = None
+    """With --hand: of the object, kg; None is that of the file, or of water."""
+
+    density: float | None = None
+    """With --hand: of the object, kg/m^3, in place of --mass."""
+
+    torsional_friction: float | None = None
+    """With --hand: of every contact, m; None keeps the models'."""
+
+    condim: int | None = None
+    """With --hand: MuJoCo's dimension of every contact, 1, 3, 4 or 6; None keeps the models'."""
+
+    base: str = "free"
+    """With --hand: how the frame of the hand file's world stands in the world: free, fixed or mocap."""
+
+    gravity_vector: tuple[float, float, float] | None = None
+    """With --hand: gravity in the world, m/s^2, which the object's weight is borne in; None keeps the hand file's."""
+
+    table: float | None = None
+    """With --hand: height of a horizontal plane, which is no finger, m; None for none."""
+
+    hand_body: str | None = None
+    """The hand's first body; None is what joints move, and what these hang on."""
+
+    environment: tuple[str, ...] = ()
+    """Bodies that are not the hand's; with --hand also an MJCF FILE of what stands around."""
+
+    contact_distance: float = 5e-3
     """Geoms no farther apart than this touch, m."""
 
-    max_contacts: int = 8
-    """How many contacts a grasp keeps, the nearest ones."""
+    max_contacts: int | None = None
+    """Of how many links a grasp keeps the contacts, the nearest ones; None for all."""
+
+    points_per_link: int = 1
+    """1 makes one contact of each link, at the mean of its near points; more are as many points, spread apart."""
+
+    unreached: str = "held"
+    """What joint directions do that nothing drives: held bear any torque, free none."""
+
+    engine: str | None = None
+    """What finds contacts: mujoco or distance; None takes mujoco on CPUs, distance elsewhere."""
 
     picture: Path | None = Path("hands.png")
     """The rendered picture of the best configurations to write, .png; None for none."""
@@ -48,17 +96,98 @@ class HandScene:
         Raises:
             CommandError: An option cannot be used.
         """
+        from jaxgrasp.hands.engines import ENGINES
+        from jaxgrasp.hands.mechanics import UNREACHED
+
+        most, engines = self.max_contacts, ", ".join(ENGINES)
         check_options(
             ("--contact-distance", self.contact_distance, 0.0 <= self.contact_distance < math.inf, "metres >= 0"),
-            ("--max-contacts", self.max_contacts, self.max_contacts >= 1, "at least 1"),
+            ("--max-contacts", most, most is None or most >= 1, "at least 1"),
+            ("--points-per-link", self.points_per_link, self.points_per_link >= 1, "at least 1"),
+            ("--unreached", self.unreached, self.unreached in UNREACHED, " or ".join(UNREACHED)),
+            ("--engine", self.engine, self.engine in (None, *ENGINES), f"one of {engines}"),
         )
+        if self.scene and self.hand:
+            raise CommandError("--hand: got --scene, too; wanted one of them")
+        if self.scene:
+            alone = {name: getattr(self, name) for name in _OF_BUILT if getattr(self, name) is not None}
+            for name in alone:
+                raise CommandError(f"--{name.replace('_', '-')}: got --scene, too; wanted --hand and --object with it")
+
+    @property
+    def given(self) -> bool:
+        """Whether there is a hand at all."""
+        return bool(self.scene or self.hand)
+
+    @property
+    def name(self) -> str:
+        """What the hand is called."""
+        return self.scene or self.hand or ""
 
     @property
     def built_in(self) -> bool:
         """Whether the scene comes with the package."""
         return self.scene in BUILT_IN
 
-    def hand(self, friction: float | None, max_force: float | None) -> "HandObject":
+    def built(self, object: str, scale: float, friction: float | None) -> "hands.Scene":
+        """The scene of --hand and an object.
+
+        Raises:
+            CommandError: It cannot be built.
+        """
+        from jaxgrasp.hands import Scene as Built
+
+        assert self.hand is not None
+        files = [name for name in self.environment if Path(name).suffix]
+        if len(files) > 1:
+            raise CommandError(f"--environment: got {len(files)} files; wanted one")
+        try:
+            return Built.build(
+                hand=self.hand,
+                object=object,
+                scale=scale,
+                friction=friction,
+                gravity=self.gravity_vector,
+                environment=files[0] if files else None,
+                **{name: getattr(self, name) for name in ("base", *_OF_BUILT) if name != "gravity_vector"},
+            )
+        except ValueError as error:
+            raise CommandError(f"--{' '.join(str(error).split())}") from error
+
+    def hand_of(
+        self, scene: "Path | MjSpec | MjModel", friction: float | None, max_force: float | None
+    ) -> "HandObject":
+        """The hand and the object of a scene; what is not modelled is said once, on standard error.
+
+        Raises:
+            CommandError: It cannot be used.
+        """
+        from jaxgrasp.hands import HandObject
+
+        try:
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                hand = HandObject.from_mjcf(
+                    scene,
+                    self.object_body,
+                    hand_body=self.hand_body,
+                    environment=[name for name in self.environment if not (self.hand and Path(name).suffix)],
+                    contact_distance=self.contact_distance,
+                    points_per_link=self.points_per_link,
+                    max_contacts=self.max_contacts,
+                    unreached=self.unreached,
+                    friction=friction,
+                    max_force=10.0 if max_force is None else max_force,
+                )
+        except (ValueError, OSError) as error:
+            raise CommandError(f"{self.name}: {' '.join(str(error).split())}") from error
+        for warning in told:
+            if str(warning.message) not in _SAID:
+                _SAID.add(str(warning.message))
+                print(f"jaxgrasp: {warning.message}", file=sys.stderr)
+        return hand
+
+    def hand_object(self, friction: float | None, max_force: float | None) -> "HandObject":
         """Reads the scene.
 
         Args:
@@ -68,21 +197,14 @@ class HandScene:
         Raises:
             CommandError: It cannot be used.
         """
-        from jaxgrasp.hands import HandObject, scenes
+        from jaxgrasp.hands import scenes
 
         assert self.scene is not None
         try:
             given = getattr(scenes, self.scene)(self.object_shape) if self.built_in else Path(self.scene)
-            return HandObject.from_mjcf(
-                given,
-                self.object_body,
-                contact_distance=self.contact_distance,
-                max_contacts=self.max_contacts,
-                friction=friction,
-                max_force=10.0 if max_force is None else max_force,
-            )
         except (ValueError, OSError) as error:
             raise CommandError(f"--scene {self.scene}: {' '.join(str(error).split())}") from error
+        return self.hand_of(given, friction, max_force)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +214,17 @@ class Scene(HandScene):
     scene: str | None = None
     """Rank configurations of a hand: an MJCF file with a hand and an object, or shadow_hand or four_fingers, which come
     with the package. The weight in the scene's gravity must be borne."""
+
+    object: str | None = None
+    """With --hand: a folder of convex pieces, a mesh, an MJCF or URDF file, or sphere, capsule, box, cylinder or
+    ellipsoid, 1 m wide along x."""
+
+    scale: float | None = None
+    """With --hand: of the object's lengths; None is the grasps' own obj_scale, or 1."""
+
+    grasps: tuple[Path, ...] = ()
+    """With --hand: files of grasps, .npz: grasp_qpos (N, 7 + n), pose of the base and joints, and where present
+    obj_pose (N, 7), obj_scale (N,) and joint_names; other columns travel along."""
 
     qpos: Path | None = None
     """Configurations: .npy (N, nq), or .npz with the field qpos; other columns travel along. None samples them around
@@ -118,48 +251,67 @@ class Scene(HandScene):
         Raises:
             CommandError: An option cannot be used.
         """
-        if self.scene is None:
+        if not self.given:
             if self.qpos is not None:
                 raise CommandError("--qpos: got a file without --scene; wanted the scene that it is for, too")
+            if self.grasps or self.object:
+                raise CommandError("--grasps or --object: got no --hand; wanted the hand that they are for, too")
             return
         super().check()
+        if self.hand and (self.object is None or not self.grasps):
+            raise CommandError("--hand: got no --object or no --grasps; wanted both")
+        if self.scene and (self.grasps or self.object or self.scale is not None):
+            raise CommandError("--scene: got --grasps, --object or --scale, too; wanted --hand for these")
+        if self.hand and self.qpos is not None:
+            raise CommandError("--qpos: got --hand, too; wanted --grasps")
         check_options(
+            ("--scale", self.scale, self.scale is None or 0.0 < self.scale < math.inf, "a number > 0"),
             ("--samples", self.samples, self.samples >= 1, "at least 1"),
             ("--min-contacts", self.min_contacts, self.min_contacts >= 0, "a number >= 0"),
             ("--max-penetration", self.max_penetration, self.max_penetration >= 0.0, "metres >= 0"),
         )
 
-    def candidates(self, hand: "HandObject") -> "Candidates":
+    def candidates(self, friction: float | None, max_force: float | None) -> "tuple[Candidates, list[HandObject]]":
         """Reads or samples the configurations, finds their contacts and leaves out what the options say.
 
+        Returns:
+            The candidates, and the scenes that they are of: the column `scene` says which.
+
         Raises:
-            CommandError: The file cannot be used, or no configuration is left.
+            CommandError: The files or the scene cannot be used, or no configuration is left.
         """
+        from jaxgrasp.cli.hand_grasps import candidates_of_grasps
         from jaxgrasp.cli.report import counting_bar
-        from jaxgrasp.ranking.configurations import candidates_of, kept
+        from jaxgrasp.ranking.configurations import candidates_of, kept, trimmed
 
-        columns: dict[str, np.ndarray] = {}
-        if self.qpos is None:
-            from jaxgrasp.hands import sample_configurations
-
-            with counting_bar("closing fingers", self.samples) as progress:
-                qpos = sample_configurations(hand, self.samples, self.seed, progress)
+        if self.hand:
+            found, hands = candidates_of_grasps(self, friction, max_force)
         else:
-            qpos, columns = self._read(hand)
-        with counting_bar("finding contacts", len(qpos)) as progress:
-            found = candidates_of(
-                hand,
-                qpos,
-                source=self.scene if self.qpos is None else str(self.qpos),
-                limited=self.actuators,
-                columns=columns,
-                progress=progress,
-            )
+            hands = [self.hand_object(friction, max_force)]
+            columns: dict[str, np.ndarray] = {}
+            if self.qpos is None:
+                from jaxgrasp.hands import sample_configurations
+
+                with counting_bar("closing fingers", self.samples) as progress:
+                    qpos = sample_configurations(hands[0], self.samples, self.seed, progress)
+            else:
+                qpos, columns = self._read(hands[0])
+            with counting_bar("finding contacts", len(qpos)) as progress:
+                found = candidates_of(
+                    hands[0],
+                    qpos,
+                    source=self.name if self.qpos is None else str(self.qpos),
+                    limited=self.actuators,
+                    columns=columns,
+                    engine=self.engine,
+                    progress=progress,
+                )
+        self._tell(found)
         left = kept(found, self.min_contacts, self.max_penetration)
         touching = found.columns["touching"]
         if not left.any():
             raise CommandError(
-                f"--scene {self.scene}: none of {len(qpos):,} configurations has {self.min_contacts} contacts and less "
+                f"{self.name}: none of {len(found):,} configurations has {self.min_contacts} contacts and less "
                 f"than {1e3 * self.max_penetration:g} mm of penetration (the most contacts are {touching.max()}, the "
                 f"least penetration is {1e3 * found.columns['penetration'].min():.3g} mm); wanted fingers that touch, "
                 "or other --contact-distance, --min-contacts, --max-penetration"
@@ -168,11 +320,26 @@ class Scene(HandScene):
         deep = int((found.columns["penetration"] > self.max_penetration).sum())
         if not left.all():
             print(
-                f"jaxgrasp: left out {int((~left).sum()):,} of {len(qpos):,} configurations: {few:,} with fewer than "
+                f"jaxgrasp: left out {int((~left).sum()):,} of {len(found):,} configurations: {few:,} with fewer than "
                 f"{self.min_contacts} contacts, {deep:,} deeper than {1e3 * self.max_penetration:g} mm",
                 file=sys.stderr,
             )
-        return found.take(np.flatnonzero(left))
+        return trimmed(found.take(np.flatnonzero(left))), hands
+
+    def _tell(self, found: "Candidates") -> None:
+        """Says how contacts were made, and what --max-contacts left out."""
+        points = "one contact" if self.points_per_link == 1 else f"up to {self.points_per_link} contacts"
+        print(
+            f"jaxgrasp: {points} for each link within {1e3 * self.contact_distance:g} mm of the object",
+            file=sys.stderr,
+        )
+        out = found.columns["left_out"]
+        if out.any():
+            print(
+                f"jaxgrasp: --max-contacts {self.max_contacts} leaves out links of {int((out > 0).sum()):,} "
+                f"configurations, {int(out.max())} at most",
+                file=sys.stderr,
+            )
 
     def _read(self, hand: "HandObject") -> tuple[np.ndarray, dict[str, np.ndarray]]:
         from jaxgrasp.candidates import CandidateError, read_archive, read_array
@@ -193,7 +360,7 @@ class Scene(HandScene):
                 raise CommandError(f"{self.qpos}: {name}: got shape {column.shape}; wanted ({len(qpos)}, ...)")
         return np.asarray(qpos, float), columns
 
-    def draw(self, hand: "HandObject", ranking: "Ranking", unit: str, path: Path) -> None:
+    def draw(self, hands: "list[HandObject]", ranking: "Ranking", unit: str, path: Path) -> None:
         """Renders the best configurations with their tightening forces.
 
         Raises:
@@ -201,12 +368,31 @@ class Scene(HandScene):
         """
         from jaxgrasp.viewer.scene import draw_scenes
 
-        best = np.flatnonzero(np.isfinite(ranking.effort))[:_PICTURES]
-        rows = ranking.order[best]
-        qpos = ranking.candidates.columns["qpos"][rows]
-        points, forces = hand.grasps(qpos).in_world_frame(ranking.forces[best])
+        columns = ranking.candidates.columns
+        best = np.flatnonzero(np.isfinite(ranking.effort))
+        # A picture shows one scene: that of the best grasp.
+        scenes = columns["scene"][ranking.order[best]] if "scene" in columns else np.zeros(len(best), int)
+        best = best[scenes == scenes[0]][:_PICTURES]
+        hand, rows = hands[int(scenes[0])], ranking.order[best]
+        qpos = columns["qpos"][rows]
+        grasps = hand.grasps(qpos, self.engine)
+        kept = ranking.forces.shape[1]
+        forces = np.zeros((len(best), *grasps.contacts.positions.shape[1:]))
+        forces[:, :kept] = ranking.forces[best][:, : forces.shape[1]]
+        points, forces = (np.asarray(x) for x in grasps.in_world_frame(forces))
         titles = [f"#{b + 1}: margin {ranking.margin[row]:.3g} {unit}" for b, row in zip(best, rows, strict=True)]
         try:
-            draw_scenes(path, hand.model, qpos, np.asarray(points), np.asarray(forces), titles)
+            draw_scenes(path, hand.model, qpos, points, forces, titles)
         except RuntimeError as error:
             raise OSError(str(error)) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedScene(Scene):
+    """A hand and an object, of whose configurations none is left out."""
+
+    min_contacts: int = 0
+    """Leave out configurations with fewer contacts."""
+
+    max_penetration: float = math.inf
+    """Leave out configurations in which hand and object are deeper in each other, m."""

@@ -46,9 +46,7 @@ def hand_on_base(hand: str | PathLike | mujoco.MjSpec, base: str) -> mujoco.MjSp
         if model.jnt_type.tolist().count(int(mujoco.mjtJoint.mjJNT_FREE)):
             raise ValueError("it has a free joint of its own; wanted a hand without one, or base 'fixed'")
         if np.isin(model.geom_type, _STATIC).any():
-            raise ValueError(
-                "it has a plane or a height field, which cannot move; wanted none, or base 'fixed'"
-            )
+            raise ValueError("it has a plane or a height field, which cannot move; wanted none, or base 'fixed'")
         wrapped = _on_body(spec.to_xml(), bare=not model.body_mass[model.body_weldid == 0].sum())
         out = mujoco.MjSpec.from_string(wrapped, assets=spec.assets)
     except (ValueError, ElementTree.ParseError) as error:
