@@ -245,7 +245,8 @@ def test_many_points_of_one_finger_keep_no_other_finger_out():
             f'<geom type="box" size="0.011 0.01 0.0093" pos="0 0 {z}" mass="0.02" friction="0.7"/>'
             for z in (0.01, -0.01)
         )
-        jaws += f'<body name="{name}" pos="0 {0.04 * y} 0"><joint name="{name}" type="slide" axis="0 {-y} 0"/>{boxes}</body>'
+        jaws += f'<body name="{name}" pos="0 {0.04 * y} 0">'
+        jaws += f'<joint name="{name}" type="slide" axis="0 {-y} 0"/>{boxes}</body>'
     servos = "".join(
         f'<position joint="{n}" kp="2000" ctrlrange="-0.02 0.02" forcerange="-20 20"/>' for n in ("left", "right")
     )

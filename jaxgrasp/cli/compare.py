@@ -34,9 +34,10 @@ DEFAULT = (
 class Compare:
     """Compare metrics on the same grasps: how alike they rank them, and how well they predict success.
 
-    Reads the files that `jaxgrasp rank` reads, or takes a hand, an object and grasps as `rank` does, computes metrics, and writes a table and a figure of Spearman's rank
-    correlations. Where the files have a column that says which grasps succeeded, ROC curves and the areas under them
-    come along, with 95 % bootstrap intervals. A grasp without an answer counts as the worst.
+    Reads the files that `jaxgrasp rank` reads, or takes a hand, an object and grasps as `rank` does, computes metrics,
+    and writes a table and a figure of Spearman's rank correlations. Where the files have a column that says which
+    grasps succeeded, ROC curves and the areas under them come along, with 95 % bootstrap intervals. A grasp without an
+    answer counts as the worst.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]] = ()

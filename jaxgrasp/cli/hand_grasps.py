@@ -9,7 +9,7 @@ from jaxgrasp.cli.problems import CommandError
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
-    from jaxgrasp.cli.scene import Scene
+    from jaxgrasp.cli.scene import GivenScene
     from jaxgrasp.hands import HandObject
 
 _STAGE = "grasp_qpos"
@@ -17,7 +17,7 @@ _POSE = 7
 
 
 def candidates_of_grasps(
-    options: "Scene", friction: float | None, max_force: float | None
+    options: "GivenScene", friction: float | None, max_force: float | None
 ) -> "tuple[Candidates, list[HandObject]]":
     """The candidates of all files of grasps, in their order, and the scenes that they are of.
 
@@ -78,7 +78,7 @@ def _table(path: Path) -> dict[str, np.ndarray]:
     return {name: x for name, x in table.items() if name == "joint_names" or (x.ndim and len(x) == count)}
 
 
-def _scales(options: "Scene", table: dict[str, np.ndarray]) -> np.ndarray:
+def _scales(options: "GivenScene", table: dict[str, np.ndarray]) -> np.ndarray:
     count = len(table[_STAGE])
     if options.scale is not None:
         return np.full(count, options.scale)
@@ -95,8 +95,8 @@ def _configurations(path: Path, built, table: dict[str, np.ndarray | None]) -> n
     if stage.ndim != 2 or stage.shape[1] != _POSE + count or stage.dtype.kind not in "fiu":
         wanted = ", ".join(built.joint_names if names is None else map(str, names))
         raise CommandError(
-            f"{path}: {_STAGE}: got {stage.dtype} {stage.shape}; wanted (N, {_POSE + count}): the pose of the base, then "
-            f"{wanted}"
+            f"{path}: {_STAGE}: got {stage.dtype} {stage.shape}; wanted (N, {_POSE + count}): the pose of the base, "
+            f"then {wanted}"
         )
     joints = stage[:, _POSE:] if names is None else dict(zip(map(str, names), stage[:, _POSE:].T, strict=True))
     try:

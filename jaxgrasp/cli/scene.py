@@ -208,8 +208,8 @@ class HandScene:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene(HandScene):
-    """A hand and an object, whose candidates are configurations."""
+class GivenScene(HandScene):
+    """A hand and an object, whose candidates are configurations of files."""
 
     scene: str | None = None
     """Rank configurations of a hand: an MJCF file with a hand and an object, or shadow_hand or four_fingers, which come
@@ -227,14 +227,7 @@ class Scene(HandScene):
     obj_pose (N, 7), obj_scale (N,) and joint_names; other columns travel along."""
 
     qpos: Path | None = None
-    """Configurations: .npy (N, nq), or .npz with the field qpos; other columns travel along. None samples them around
-    the scene's own: the object turned and moved, the fingers closed until they touch."""
-
-    samples: int = SAMPLED
-    """How many configurations to sample."""
-
-    seed: int = 0
-    """Of the samples."""
+    """With --scene: configurations, .npy (N, nq), or .npz with the field qpos; other columns travel along."""
 
     min_contacts: int = 2
     """Leave out configurations with fewer contacts."""
@@ -266,7 +259,6 @@ class Scene(HandScene):
             raise CommandError("--qpos: got --hand, too; wanted --grasps")
         check_options(
             ("--scale", self.scale, self.scale is None or 0.0 < self.scale < math.inf, "a number > 0"),
-            ("--samples", self.samples, self.samples >= 1, "at least 1"),
             ("--min-contacts", self.min_contacts, self.min_contacts >= 0, "a number >= 0"),
             ("--max-penetration", self.max_penetration, self.max_penetration >= 0.0, "metres >= 0"),
         )
@@ -289,13 +281,7 @@ class Scene(HandScene):
         else:
             hands = [self.hand_object(friction, max_force)]
             columns: dict[str, np.ndarray] = {}
-            if self.qpos is None:
-                from jaxgrasp.hands import sample_configurations
-
-                with counting_bar("closing fingers", self.samples) as progress:
-                    qpos = sample_configurations(hands[0], self.samples, self.seed, progress)
-            else:
-                qpos, columns = self._read(hands[0])
+            qpos, columns = (self._sampled(hands[0]), columns) if self.qpos is None else self._read(hands[0])
             with counting_bar("finding contacts", len(qpos)) as progress:
                 found = candidates_of(
                     hands[0],
@@ -325,6 +311,9 @@ class Scene(HandScene):
                 file=sys.stderr,
             )
         return trimmed(found.take(np.flatnonzero(left))), hands
+
+    def _sampled(self, hand: "HandObject") -> np.ndarray:
+        raise CommandError("--scene: got no --qpos; wanted configurations of it")
 
     def _tell(self, found: "Candidates") -> None:
         """Says how contacts were made, and what --max-contacts left out."""
@@ -388,7 +377,38 @@ class Scene(HandScene):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ComparedScene(Scene):
+class Scene(GivenScene):
+    """A hand and an object, whose candidates are configurations of files, or sampled."""
+
+    qpos: Path | None = None
+    """With --scene: configurations, .npy (N, nq), or .npz with the field qpos; other columns travel along. None samples
+    them around the scene's own: the object turned and moved, the fingers closed until they touch."""
+
+    samples: int = SAMPLED
+    """How many configurations to sample."""
+
+    seed: int = 0
+    """Of the samples."""
+
+    def check(self) -> None:
+        """Finds what cannot be used before any long work.
+
+        Raises:
+            CommandError: An option cannot be used.
+        """
+        super().check()
+        check_options(("--samples", self.samples, self.samples >= 1, "at least 1"))
+
+    def _sampled(self, hand: "HandObject") -> np.ndarray:
+        from jaxgrasp.cli.report import counting_bar
+        from jaxgrasp.hands import sample_configurations
+
+        with counting_bar("closing fingers", self.samples) as progress:
+            return sample_configurations(hand, self.samples, self.seed, progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedScene(GivenScene):
     """A hand and an object, of whose configurations none is left out."""
 
     min_contacts: int = 0

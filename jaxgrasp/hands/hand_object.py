@@ -370,14 +370,13 @@ class HandObject:
         moved = xp.asarray(self.moved_bodies)[found.link]
         frames = xp.asarray(contacts.frames)
         jacobian = self._mechanics.jacobians(geometry, found.position, moved, frames, rotation, xp)
-        kept = found.active.sum(-1)
         as_float_array = lambda x: jnp.asarray(x, jnp.result_type(float) if xp is np else qpos.dtype)  # noqa: E731
         return HandGrasps(
             contacts=contacts,
             distances=as_float_array(found.distance),
             links=jnp.asarray(found.link),
             touching=jnp.asarray(found.touching),
-            left_out=jnp.asarray(found.touching - kept),
+            left_out=jnp.asarray(found.left_out),
             penetration=as_float_array(xp.maximum(0, -geometry.points.distance.min(-1))),
             required_wrench=as_float_array(xp.where(admissible[:, None], self._weight(rotation, xp), np.nan)),
             actuator_lengths=as_float_array(geometry.lengths),

@@ -55,7 +55,9 @@ class LinkContacts(NamedTuple):
     active: Array
     """(n, contacts), whether they touch."""
     touching: Array
-    """(n,), how many touch, also those that are left out."""
+    """(n,), how many links touch (points, where all points are contacts), also those that are left out."""
+    left_out: Array
+    """(n,), how many of these are left out."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class ContactRule:
         stacked = LinkContacts(*(xp.stack(parts, 1) for parts in zip(*found, strict=True)))
         kept = _nearest(stacked, self.max_contacts, xp)
         flat = lambda x: x.reshape(x.shape[0], -1, *x.shape[3:])  # noqa: E731
-        return LinkContacts(*map(flat, kept[:-1]), kept.touching)
+        return LinkContacts(*map(flat, kept[:-2]), kept.touching, kept.left_out)
 
 
 def _nearest(contacts: LinkContacts, count: int | None, xp: ModuleType) -> LinkContacts:
@@ -90,9 +92,9 @@ def _nearest(contacts: LinkContacts, count: int | None, xp: ModuleType) -> LinkC
     distance = distance.min(-1) if distance.ndim == 3 else distance
     order = xp.argsort(distance, axis=-1, stable=True)[:, :count]
     pick = lambda x: xp.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - 2)), axis=1)  # noqa: E731
-    active = contacts.active
-    touching = (active.any(-1) if active.ndim == 3 else active).sum(-1)
-    return LinkContacts(*map(pick, contacts[:-1]), touching)
+    kept = [pick(x) for x in contacts[:-2]]
+    counts = [(x.any(-1) if x.ndim == 3 else x).sum(-1) for x in (contacts.active, kept[-1])]
+    return LinkContacts(*kept, counts[0], counts[0] - counts[1])
 
 
 def _all_points(raw: RawPoints, xp: ModuleType) -> LinkContacts:
@@ -100,7 +102,7 @@ def _all_points(raw: RawPoints, xp: ModuleType) -> LinkContacts:
     there = xp.isfinite(raw.distance)
     position, normal = _filled(raw, there, xp)
     active = there & (raw.distance <= reach)
-    return LinkContacts(position, normal, raw.distance, friction, link, active, active.sum(-1))
+    return LinkContacts(position, normal, raw.distance, friction, link, active, active, active)
 
 
 def _of_link(raw: RawPoints, link: int, count: int, xp: ModuleType) -> LinkContacts:
@@ -143,6 +145,7 @@ def _of_link(raw: RawPoints, link: int, count: int, xp: ModuleType) -> LinkConta
                 link=xp.full(distance.shape[:1], link),
                 active=is_there,
                 touching=active,
+                left_out=active,
             )
         )
     return LinkContacts(*(xp.stack(x, 1) for x in zip(*parts, strict=True)))
