@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxgrasp.cli.hand_scene import HandScene
 from jaxgrasp.cli.problems import CommandError, check_options, write_files
-from jaxgrasp.cli.scene import HandScene
 
 if TYPE_CHECKING:
     from jaxgrasp.disturbance import DisturbanceSet

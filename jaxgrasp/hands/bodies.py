@@ -83,3 +83,25 @@ def _chain(model: mujoco.MjModel, body: int) -> list[int]:
         chain.append(body)
         body = int(model.body_parentid[body])
     return chain
+
+
+def gravity_of(model: mujoco.MjModel) -> np.ndarray:
+    """(3,), m/s^2, world frame; zero where the scene switches it off."""
+    return model.opt.gravity * (not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY))
+
+
+def weighing_mass(model: mujoco.MjModel, object: np.ndarray) -> tuple[float, np.ndarray]:
+    """The object's mass less what gravity compensation takes off, kg, and its first moment (3,), kg m.
+
+    The moment is about the centre of all mass, in the object's frame.
+
+    Args:
+        model: The scene.
+        object: Bodies of the object, which are fixed to the first one.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    masses = np.maximum(model.body_mass[object], 1e-12)
+    centres = data.xipos[object] - masses @ data.xipos[object] / masses.sum()
+    weighing = model.body_mass[object] * (1 - model.body_gravcomp[object])
+    return float(weighing.sum()), weighing @ centres @ data.xmat[object[0]].reshape(3, 3)

@@ -18,18 +18,18 @@ from jaxgrasp.arrays import as_float, frames_from_normals
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts
 from jaxgrasp.hands.actuators import Actuators, read_actuators
-from jaxgrasp.hands.bodies import bodies_below, body_named, hand_bodies, read_model
+from jaxgrasp.hands.bodies import bodies_below, body_named, gravity_of, hand_bodies, read_model, weighing_mass
 from jaxgrasp.hands.contact_parameters import hand_object_pairs
 from jaxgrasp.hands.couplings import Couplings, read_couplings
-from jaxgrasp.hands.engines import Geometry, engine_for
+from jaxgrasp.hands.distance_engine import DistanceEngine
+from jaxgrasp.hands.engines import engine_for
 from jaxgrasp.hands.grasps import HandGrasps
-from jaxgrasp.hands.kinematics import BALL, FREE, HINGE, SLIDE, Kinematics, Poses, matrices, place
+from jaxgrasp.hands.kinematics import BALL, FREE, HINGE, SLIDE, Kinematics, Poses
 from jaxgrasp.hands.link_contacts import ContactRule, RawPoints
 from jaxgrasp.hands.mechanics import Mechanics, point_velocities
 from jaxgrasp.hands.mujoco_engine import MujocoEngine
-from jaxgrasp.hands.passive import read_passive, spring_torques
-from jaxgrasp.hands.tendons import spatial_transmission
-from jaxgrasp.hands.touching import PairTable, Points, pair_table, touching_points
+from jaxgrasp.hands.passive import read_passive
+from jaxgrasp.hands.touching import Points
 
 # Quaternions are normalised; farther from 1 than this they are taken for a mistake.
 _QUATERNION_TOLERANCE = 1e-3
@@ -203,7 +203,7 @@ class HandObject:
             qpos = as_float("qpos", qpos, ())
             self._check_length(qpos.shape)
             # What cannot be measured is told before anything is compiled.
-            _ = self._table
+            _ = self._distances
             batch = qpos.shape[:-1]
             flat = self._compiled(qpos.reshape(-1, self.nq).astype(jnp.result_type(float)))
         return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), flat)
@@ -273,29 +273,20 @@ class HandObject:
             tall.shape[-2], dtype=tall.dtype
         )
 
-    @cached_property
-    def kinematics(self) -> Kinematics:
-        """Poses of all bodies, by JAX."""
-        return Kinematics(self.model)
-
-    @cached_property
-    def _table(self) -> PairTable:
-        return pair_table(self.model, self.bodies, bodies_below(self.model, self.object_body))
-
     @property
     def slot_links(self) -> np.ndarray:
         """(slots,), the body of the hand of every point that `points` looks at."""
-        return self._table.link
+        return self._distances.table.link
 
     @property
     def slot_friction(self) -> np.ndarray:
         """(slots,), Coulomb's coefficient of every such point."""
-        return self._table.friction if self.friction is None else np.full(len(self._table.link), self.friction)
+        return self._distances.table.friction if self.friction is None else np.full(len(self.slot_links), self.friction)
 
     @property
     def touching_geoms(self) -> np.ndarray:
         """Numbers of the geoms of hand and object that can touch."""
-        return self._table.geoms
+        return self._distances.table.geoms
 
     @cached_property
     def moved_bodies(self) -> np.ndarray:
@@ -313,24 +304,18 @@ class HandObject:
         """
         poses = self.kinematics.poses(qpos.T)
         points = self.points(poses)
-        axes, anchors = self._of_joints(poses)
+        axes, anchors = self._distances.of_joints(poses)
         hinge, moved = self.model.jnt_type[self.joints] == HINGE, self.moved_bodies[self.slot_links]
         velocity = point_velocities(axes, anchors, hinge, points.position, moved, jnp)
         return points, jnp.einsum("nsvi,nsi->nsv", velocity, points.normal)
 
     def frames(self, qpos: Float[Array, "n nq"]) -> tuple[Poses, Array, Array]:
         """Poses of all bodies, and the object's frame (n, 3, 3) and centre of mass (n, 3), m, world frame."""
-        poses = self.kinematics.poses(qpos.T)
-        return poses, jnp.moveaxis(poses.rotations[:, :, self.object_body], -1, 0), self._mass_centre(poses)
+        return self._distances.frames(qpos)
 
     def points(self, poses: Poses) -> Points:
         """All points where geoms touch or come near, (n, slots, ...)."""
-        table, model = self._table, self.model
-        bodies, offsets = model.geom_bodyid[table.geoms], model.geom_pos[table.geoms].T
-        rotations, positions = place(
-            poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, matrices(model.geom_quat[table.geoms])
-        )
-        return Points(*[jnp.moveaxis(x, -1, 0) for x in touching_points(table, positions, rotations)])
+        return self._distances.points(poses)
 
     @cached_property
     def _compiled(self):
@@ -353,7 +338,7 @@ class HandObject:
         """For (n, nq), by engine `mujoco` in NumPy, by `distance` in JAX's arrays."""
         admissible = self._admissible(qpos, xp)
         safe = xp.where(admissible[:, None], qpos, self.model.qpos0.astype(qpos.dtype))
-        geometry = self._engine.find(safe) if xp is np else self._by_distance(safe)
+        geometry = self._engine.find(safe) if xp is np else self._distances.find(safe)
         found = self.rule.contacts(geometry.points, self.touching_links, xp)
         rotation, centre = geometry.object_rotation, geometry.object_position
         in_object = lambda x: xp.einsum("nji,ncj->nci", rotation, x)  # noqa: E731
@@ -390,38 +375,22 @@ class HandObject:
         of_object = bodies_below(self.model, self.object_body)
         return MujocoEngine(self.model, self.bodies, of_object, self.joints, self.actuators, self.contact_distance)
 
-    def _by_distance(self, qpos: jax.Array) -> Geometry:
-        """By signed distances."""
-        poses, rotation, centre = self.frames(qpos)
-        near, table = self.points(poses), self._table
-        reach = np.maximum(self.contact_distance, table.margin).astype(qpos.dtype)
-        friction = table.friction.astype(qpos.dtype)
-        return self._geometry(qpos, poses, rotation, centre, RawPoints(*near, table.link, friction, reach))
+    @cached_property
+    def _distances(self) -> DistanceEngine:
+        of_object = bodies_below(self.model, self.object_body)
+        return DistanceEngine(self.model, self.bodies, of_object, self.joints, self._actuators, self.contact_distance)
 
-    def _geometry(self, qpos: jax.Array, poses: Poses, rotation: Array, centre: Array, points: RawPoints) -> Geometry:
-        axes, anchors = self._of_joints(poses)
-        lengths, moments = self._lengths(qpos)
-        springs = spring_torques(self.model, self.joints, qpos, jnp)
-        return Geometry(points, rotation, centre, anchors, axes, lengths, moments, springs)
+    @property
+    def kinematics(self) -> Kinematics:
+        """Poses of all bodies, by JAX."""
+        return self._distances.kinematics
 
-    def _of_joints(self, poses: Poses) -> tuple[Array, Array]:
-        """Axes and anchors of the hand's joints, (n, joints, 3)."""
-        return poses.axes[:, self.joints].T, poses.anchors[:, self.joints].T
-
-    def _weight(self, rotation: Array, xp: ModuleType) -> Array:
-        """What bears the object's weight less its gravity compensation, (n, 6), in the object's frame."""
-        model, bodies = self.model, bodies_below(self.model, self.object_body)
-        on = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        turn = data.xmat[self.object_body].reshape(3, 3)
-        centres = (data.xipos[bodies] - data.xipos[self.object_body]) @ turn
-        masses = np.maximum(model.body_mass[bodies], 1e-12)
-        borne = model.body_mass[bodies] * (1 - model.body_gravcomp[bodies])
-        lever = borne @ (centres - masses @ centres / masses.sum())
-        gravity = xp.einsum("nji,j->ni", rotation, (on * model.opt.gravity).astype(rotation.dtype))
+    def _weight(self, rotation: Array | np.ndarray, xp: ModuleType) -> Array | np.ndarray:
+        """What bears the object's weight, (n, 6), in the object's frame."""
+        mass, lever = weighing_mass(self.model, bodies_below(self.model, self.object_body))
+        gravity = xp.einsum("nji,j->ni", rotation, gravity_of(self.model).astype(rotation.dtype))
         moment = xp.cross(lever.astype(rotation.dtype), gravity)
-        return -xp.concatenate([float(borne.sum()) * gravity, moment], -1)
+        return -xp.concatenate([mass * gravity, moment], -1)
 
     def _admissible(self, qpos: Array | np.ndarray, xp: ModuleType) -> Array | np.ndarray:
         fine = xp.isfinite(qpos).all(-1)
@@ -432,37 +401,14 @@ class HandObject:
             fine = fine & (squared >= least) & (squared <= most)
         return fine
 
-    def _mass_centre(self, poses: Poses) -> jax.Array:
-        """(n, 3)."""
-        bodies = bodies_below(self.model, self.object_body)
-        # An object that is fixed to the world may have no mass.
-        masses = np.maximum(self.model.body_mass[bodies], 1e-12)
-        offsets, turns = self.model.body_ipos[bodies].T, np.repeat(np.eye(3)[..., None], len(bodies), -1)
-        centres = place(poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, turns)[1]
-        return jnp.einsum("b,ibn->ni", jnp.asarray(masses / masses.sum(), centres.dtype), centres)
-
     def actuation_at(
         self, qpos: jax.Array, poses: Poses, world: jax.Array, rotation: jax.Array, frames: jax.Array, links: jax.Array
     ) -> Actuation | None:
         """What the hand can do at given points (n, n_c, 3) of its links, m, world frame."""
         none = jnp.zeros((len(qpos), 0), qpos.dtype)
         points = RawPoints(world, world, none, none, none, none)
-        geometry = self._geometry(qpos, poses, rotation, world[:, 0], points)
+        geometry = self._distances.geometry(qpos, poses, rotation, world[:, 0], points)
         moved = jnp.asarray(self.moved_bodies)[links]
         jacobian = self._mechanics.jacobians(geometry, world, moved, frames, rotation, jnp)
         joints = qpos[:, self.model.jnt_qposadr[self.joints]]
         return self._mechanics.actuation(geometry, joints, jacobian, False, jnp)["actuation"]
-
-    def _lengths(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array | np.ndarray]:
-        """Lengths (n, actuators) and B, (joints, actuators) where it is the same everywhere."""
-        joints = qpos[:, self.model.jnt_qposadr[self.joints]]
-        numbers, constant = self._actuators.numbers, self._actuators.transmission
-        if constant is not None:
-            data = mujoco.MjData(self.model)
-            mujoco.mj_forward(self.model, data)
-            start = jnp.asarray(data.actuator_length[numbers], qpos.dtype)
-            rest = jnp.asarray(self.model.qpos0[self.model.jnt_qposadr[self.joints]], qpos.dtype)
-            return start + (joints - rest) @ jnp.asarray(constant, qpos.dtype), constant
-
-        lengths, moments = jax.vmap(spatial_transmission(self.model))(qpos)
-        return lengths[:, numbers], jnp.swapaxes(moments[:, numbers][:, :, self.dofs], -1, -2)
