@@ -31,7 +31,8 @@ def folder(tmp_path, monkeypatch):
     # Cubes of 6 and 5 cm in turn; the pads of each second grasp of a size stay 3 cm off.
     scales = np.array([0.06, 0.05] * 4)
     off = np.repeat([0.0, 0.03] * 2, 2)
-    joints = np.tile((0.05 - scales / 2 - off)[:, None], (1, 4))
+    # 0.1 mm deep: exactly on the surface C's collision of meshes may find nothing.
+    joints = np.tile((0.0501 - scales / 2 - off)[:, None], (1, 4))
     base = np.tile([0.1, 0.2, 0.3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (8, 1))
     np.savez(
         "grasps.npz",
@@ -62,7 +63,7 @@ def test_one_scene_a_scale_in_the_order_of_the_file(folder, capsys):
     np.testing.assert_array_equal(table["left_out"], 0)
     margin = table["margin"][back]
     # 4 x 10 N at friction 0.6 in an octagon of edges, under 0.981 N: the same for both sizes.
-    np.testing.assert_allclose(margin[[0, 4]], margin[[1, 5]], rtol=1e-6)
+    np.testing.assert_allclose(margin[[0, 4]], margin[[1, 5]], rtol=1e-3)
     assert margin[0] > 5 and set(table["index"][:4]) == {0, 1, 4, 5}
 
 

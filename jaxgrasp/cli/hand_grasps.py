@@ -10,7 +10,7 @@ from jaxgrasp.cli.problems import CommandError
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.cli.scene import GivenScene
-    from jaxgrasp.hands import HandObject
+    from jaxgrasp.hands import HandObject, Scene
 
 _STAGE = "grasp_qpos"
 _POSE = 7
@@ -38,14 +38,15 @@ def candidates_of_grasps(
         done = 0
         for scale in np.unique(np.concatenate(scales)):
             built = options.built(options.object, float(scale), friction)
-            hands.append(options.hand_of(built.model, None, max_force))
+            chosen = []
             for path, table, own, start in zip(options.grasps, tables, scales, starts, strict=False):
                 rows = np.flatnonzero(own == scale)
-                if not len(rows):
-                    continue
+                if len(rows):
+                    chosen.append((path, table, rows, start, _configurations(path, built, table)[rows]))
+            hands.append(options.hand_of(built.model, None, max_force))
+            for path, table, rows, start, qpos in chosen:
                 columns = {name: x[rows] for name, x in table.items() if name not in ("joint_names", "obj_scale")}
-                qpos = _configurations(path, built, {**columns, "joint_names": table.get("joint_names")})
-                columns |= {"scene": np.full(len(rows), len(hands) - 1), "obj_scale": own[rows]}
+                columns |= {"scene": np.full(len(rows), len(hands) - 1), "obj_scale": np.full(len(rows), scale)}
                 parts.append(
                     candidates_of(
                         hands[-1],
@@ -88,9 +89,8 @@ def _scales(options: "GivenScene", table: dict[str, np.ndarray]) -> np.ndarray:
     return given.astype(float)
 
 
-def _configurations(path: Path, built, table: dict[str, np.ndarray | None]) -> np.ndarray:
-    stage, names = table[_STAGE], table["joint_names"]
-    assert stage is not None
+def _configurations(path: Path, built: "Scene", table: dict[str, np.ndarray]) -> np.ndarray:
+    stage, names = table[_STAGE], table.get("joint_names")
     count = len(built.joint_names) if names is None else len(names)
     if stage.ndim != 2 or stage.shape[1] != _POSE + count or stage.dtype.kind not in "fiu":
         wanted = ", ".join(built.joint_names if names is None else map(str, names))

@@ -33,6 +33,13 @@ class Actuators:
     reference: np.ndarray
     """B in the reference configuration, with 1 where an arm happens to be zero there."""
 
+    @property
+    def capacity(self) -> np.ndarray:
+        """Half of the range of each effort, which may be infinite."""
+        with np.errstate(invalid="ignore"):
+            command = np.where(self.gain == 0, np.inf, np.abs(self.gain) * np.ptp(self.command, axis=-1) / 2)
+            return np.minimum(command, np.ptp(self.force, axis=-1) / 2)
+
     def limits(self, length: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
         """Least and largest force at rest, (*batch, actuators), at lengths (*batch, actuators)."""
         # An actuator without gain has no command, however far that may go.

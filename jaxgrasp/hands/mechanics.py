@@ -6,6 +6,9 @@ limit of that effort away on one side, and the constant torque c of springs move
 J'f = B u + c becomes J'f = B u'. A spring on a joint that nothing else acts on is an effort whose two limits are the
 same.
 
+While a disturbance acts, efforts answer it in proportion to what they can: of all that make up J'f the smallest in
+units of their own ranges, so that neither gears nor a little dry friction beside a strong motor decide.
+
 Directions of joints that none of these reach are held (their rows are left out) or free (N'J'f = 0).
 """
 
@@ -25,6 +28,8 @@ from jaxgrasp.hands.passive import Passive
 
 UNREACHED = ("held", "free")
 _RANK = 1e-6
+# Weak efforts beside strong ones make small singular values that are none of rounding.
+_ROUNDING = {"float64": 1e-10, "float32": 1e-6}
 Array = Any
 
 
@@ -83,6 +88,14 @@ class Mechanics:
             stops=np.flatnonzero(ends & ~rough & ~(self._own != 0).any(-1)),
             springs=np.array(idle, int),
         )
+        efforts = np.concatenate([actuators.capacity, passive.friction[rough]])
+        known = efforts[np.isfinite(efforts)]
+        # What has no limit counts as the strongest of those that have one.
+        most = known.max(initial=0) or 1.0
+        efforts = np.where(np.isfinite(efforts) & (efforts > 0), efforts, most)
+        others = len(self._columns.stops), len(self._columns.springs)
+        self._places_of_stops = len(efforts) + np.arange(others[0])
+        self._capacity = np.concatenate([efforts, np.full(sum(others), most)])
         if not self._held and not (moments.shape[1] or len(self._columns.friction) or len(self._columns.springs)):
             raise ValueError("unreached: got 'free' for a hand without actuators, which bears nothing; wanted 'held'")
 
@@ -143,7 +156,9 @@ class Mechanics:
         found = {"spring_torques": as_array(turn(back, geometry.springs)), "joint_stiffness": spread(stiffness)}
         if not whole.shape[-1] or not whole.shape[-2]:
             return found | {"actuation": None, "spring_efforts": as_array(xp.zeros((len(joints), 0), dtype))}
-        inverse, unreached, projector = _reach(whole, silent, self._held, xp)
+        # Where stops do not count there are no efforts for them.
+        capacity = self._capacity if stops else np.delete(self._capacity, self._places_of_stops)
+        inverse, unreached, projector = _reach(whole, capacity, silent, self._held, xp)
         if projector is not None:
             projector = projector.astype(dtype)
             jacobian = jacobian @ (projector if projector.ndim == 2 else projector[:, None])
@@ -233,11 +248,14 @@ def _spans(columns: np.ndarray, vector: np.ndarray) -> bool:
     return bool(np.abs(left).max(initial=0) <= _RANK * max(np.abs(vector).max(initial=0), 1e-300))
 
 
-def _reach(whole: Array, silent: int, held: bool, xp: ModuleType) -> tuple[Array, Array | None, Array | None]:
+def _reach(
+    whole: Array, capacity: np.ndarray, silent: int, held: bool, xp: ModuleType
+) -> tuple[Array, Array | None, Array | None]:
     """How efforts answer: the inverse, the rows N' of directions that answer nothing, and what J is projected with.
 
     Args:
         whole: Columns of all efforts.
+        capacity: In which units efforts answer.
         silent: From this one on they are constant, and answer no disturbance.
         held: Whether directions that no effort reaches are left out.
         xp: Of arrays that vary.
@@ -245,7 +263,8 @@ def _reach(whole: Array, silent: int, held: bool, xp: ModuleType) -> tuple[Array
     within = np if whole.ndim == 2 else xp
     eye = np.eye(whole.shape[-2]).astype(whole.dtype)
     answering = within.where(np.arange(whole.shape[-1]) < silent, whole, 0)
-    inverse = _inverse(answering, within)
+    capacity = capacity.astype(whole.dtype)
+    inverse = capacity[:, None] * _inverse(answering * capacity, within)
     answered = answering @ inverse
     if not held:
         unreached, projector = eye - answered, None
@@ -263,10 +282,11 @@ def _reach(whole: Array, silent: int, held: bool, xp: ModuleType) -> tuple[Array
 
 
 def _inverse(columns: Array, xp: ModuleType) -> Array:
+    tolerance = _ROUNDING[columns.dtype.name]
     if columns.ndim == 2:
-        return np.linalg.pinv(columns, _RANK)
+        return np.linalg.pinv(columns, tolerance)
     if xp is jnp:
-        return jnp.linalg.pinv(columns, rtol=_RANK)
+        return jnp.linalg.pinv(columns, rtol=tolerance)
     # Few differ where it is only stops that make them.
     different, which = np.unique(columns.reshape(len(columns), -1), axis=0, return_inverse=True)
-    return np.linalg.pinv(different.reshape(-1, *columns.shape[1:]), _RANK)[which.reshape(-1)]
+    return np.linalg.pinv(different.reshape(-1, *columns.shape[1:]), tolerance)[which.reshape(-1)]
