@@ -58,9 +58,12 @@ def by_margin(margin: np.ndarray, held: np.ndarray) -> list[str]:
     place = np.digitize(margin, EDGES) - 1
     cells = []
     for k in range(len(NAMES)):
-        count = int((place == k).sum())
-        cells.append(f"{held[place == k].mean():.0%} of {count}" if count else "none")
+        cells.append(_share(held[place == k]))
     return cells
+
+
+def _share(held: np.ndarray) -> str:
+    return f"{held.mean():.0%} of {len(held)}" if len(held) else "none"
 
 
 def report(hand: str, folders: list[Path]) -> str:
@@ -91,8 +94,8 @@ def report(hand: str, folders: list[Path]) -> str:
     for name in ("margin", "margin with actuators"):
         lines.append(f"| {name} | {' | '.join(by_margin(metrics[name], held))} |")
     for name in ("margin", "margin with actuators"):
-        low, high = metrics[name] < 1, metrics[name] > 3
-        lines += ["", f"{name}: below 1 N {held[low].mean():.0%} held, above 3 N {held[high].mean():.0%}."]
+        low, high = (_share(held[rows]) for rows in (metrics[name] < 1, metrics[name] > 3))
+        lines += ["", f"{name}: below 1 N {low} held, above 3 N {high}."]
     return "\n".join(lines) + "\n"
 
 

@@ -12,9 +12,9 @@ from jaxgrasp.hands.bodies import one_line
 from jaxgrasp.hands.scenes import HAND_FILES
 
 BASES = ("free", "fixed", "mocap")
-BASE = "base"
+BASE = "hand-base"
 """Name of the body that the hand's file stands on, and of its free joint."""
-_DRIVER = "base-mocap"
+_DRIVER = "hand-base-mocap"
 _STATIC = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 # A base without geoms needs some inertia to move in MuJoCo, kg and kg m^2; contacts and margins do not see it.
 _LEAST_MASS, _LEAST_INERTIA = 1e-3, 1e-6

@@ -82,10 +82,13 @@ class Mechanics:
         ends = np.isfinite(passive.limits).any(-1)
         reached = self._through(np.concatenate([moments, np.eye(len(joints))[:, rough]], -1), joints, model)
         spring = np.flatnonzero(passive.sprung)
-        idle = [d for d in spring if not _spans(reached, self._through(np.eye(len(joints))[:, [d]], joints, model))]
+        spans = lambda d: _spans(reached, self._through(np.eye(len(joints))[:, [d]], joints, model))  # noqa: E731
+        idle = [d for d in spring if not spans(d)]
+        leaning = np.flatnonzero(ends & ~rough & ~(self._own != 0).any(-1))
         self._columns = _Columns(
             friction=np.flatnonzero(rough),
-            stops=np.flatnonzero(ends & ~rough & ~(self._own != 0).any(-1)),
+            # A direction that is held bears more than its stop.
+            stops=np.array([d for d in leaning if not self._held or spans(d)], int),
             springs=np.array(idle, int),
         )
         efforts = np.concatenate([actuators.capacity, passive.friction[rough]])

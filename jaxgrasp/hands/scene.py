@@ -26,7 +26,7 @@ class Scene:
     """A hand, a free object and what is around them, made with `build`."""
 
     spec: mujoco.MjSpec
-    """The scene as a specification, in which the object's body is named "object" and the hand's base "base"."""
+    """The scene as a specification, in which the object's body is named "object" and the hand's base "hand-base"."""
     model: mujoco.MjModel
     """The scene, compiled."""
 
