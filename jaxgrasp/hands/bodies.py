@@ -1,9 +1,14 @@
 """The bodies of a scene."""
 
 from os import PathLike
+from types import ModuleType
+from typing import Any
 
 import mujoco
 import numpy as np
+
+# Quaternions are normalised; farther from 1 than this they are taken for a mistake.
+_QUATERNION_TOLERANCE = 1e-3
 
 
 def one_line(error: BaseException) -> str:
@@ -85,23 +90,41 @@ def _chain(model: mujoco.MjModel, body: int) -> list[int]:
     return chain
 
 
-def gravity_of(model: mujoco.MjModel) -> np.ndarray:
-    """(3,), m/s^2, world frame; zero where the scene switches it off."""
-    return model.opt.gravity * (not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY))
+def admissible_configurations(model: mujoco.MjModel, qpos: Any, xp: ModuleType) -> Any:
+    """Which configurations (n, nq) are finite and have unit quaternions, (n,)."""
+    fine = xp.isfinite(qpos).all(-1)
+    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        start = model.jnt_qposadr[joint] + 3
+        squared = (qpos[:, start : start + 4] ** 2).sum(-1)
+        least, most = (1 - _QUATERNION_TOLERANCE) ** 2, (1 + _QUATERNION_TOLERANCE) ** 2
+        fine = fine & (squared >= least) & (squared <= most)
+    return fine
 
 
-def weighing_mass(model: mujoco.MjModel, object: np.ndarray) -> tuple[float, np.ndarray]:
-    """The object's mass less what gravity compensation takes off, kg, and its first moment (3,), kg m.
-
-    The moment is about the centre of all mass, in the object's frame.
+def wrench_against_weight(model: mujoco.MjModel, object: np.ndarray, rotation: Any, xp: ModuleType) -> Any:
+    """What bears an object's weight less its gravity compensation, (n, 6), N and N m, in its frame.
 
     Args:
         model: The scene.
         object: Bodies of the object, which are fixed to the first one.
+        rotation: (n, 3, 3), columns are the axes of the object's frame.
+        xp: numpy or jax.numpy.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    # An object that is fixed to the world may have no mass.
     masses = np.maximum(model.body_mass[object], 1e-12)
     centres = data.xipos[object] - masses @ data.xipos[object] / masses.sum()
     weighing = model.body_mass[object] * (1 - model.body_gravcomp[object])
-    return float(weighing.sum()), weighing @ centres @ data.xmat[object[0]].reshape(3, 3)
+    lever = (weighing @ centres @ data.xmat[object[0]].reshape(3, 3)).astype(rotation.dtype)
+    on = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    gravity = xp.einsum("nji,j->ni", rotation, (on * model.opt.gravity).astype(rotation.dtype))
+    return -xp.concatenate([float(weighing.sum()) * gravity, xp.cross(lever, gravity)], -1)
+
+
+def moved_by_joints(model: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
+    """(bodies, joints), bool: which of the joints move a body."""
+    moved = np.zeros((model.nbody, len(joints)), bool)
+    for body in range(1, model.nbody):
+        moved[body] = moved[model.body_parentid[body]] | (model.jnt_bodyid[joints] == body)
+    return moved

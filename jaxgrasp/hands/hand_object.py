@@ -18,7 +18,15 @@ from jaxgrasp.arrays import as_float, frames_from_normals
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts
 from jaxgrasp.hands.actuators import Actuators, read_actuators
-from jaxgrasp.hands.bodies import bodies_below, body_named, gravity_of, hand_bodies, read_model, weighing_mass
+from jaxgrasp.hands.bodies import (
+    admissible_configurations,
+    bodies_below,
+    body_named,
+    hand_bodies,
+    moved_by_joints,
+    read_model,
+    wrench_against_weight,
+)
 from jaxgrasp.hands.contact_parameters import hand_object_pairs
 from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.distance_engine import DistanceEngine
@@ -31,8 +39,6 @@ from jaxgrasp.hands.mujoco_engine import MujocoEngine
 from jaxgrasp.hands.passive import read_passive
 from jaxgrasp.hands.touching import Points
 
-# Quaternions are normalised; farther from 1 than this they are taken for a mistake.
-_QUATERNION_TOLERANCE = 1e-3
 # Configurations at a time on CPUs.
 _TILE = 512
 
@@ -291,10 +297,7 @@ class HandObject:
     @cached_property
     def moved_bodies(self) -> np.ndarray:
         """(bodies, joints), bool: which of `joints` move a body."""
-        moved = np.zeros((self.model.nbody, len(self.joints)), bool)
-        for body in range(1, self.model.nbody):
-            moved[body] = moved[self.model.body_parentid[body]] | (self.model.jnt_bodyid[self.joints] == body)
-        return moved
+        return moved_by_joints(self.model, self.joints)
 
     def approach(self, qpos: Float[Array, "n nq"]) -> tuple[Points, Float[Array, "n slots joints"]]:
         """All points where geoms touch or come near, and how fast each joint moves them apart.
@@ -325,18 +328,15 @@ class HandObject:
         """On CPUs, tiles that stay in the cache; and searches among their lanes do not wait for the slowest of all."""
         count = len(qpos)
         if count <= _TILE or jax.default_backend() != "cpu":
-            return self._grasps(qpos)
+            return self._found(qpos, jnp)
         tiles = -(-count // _TILE)
         padded = jnp.pad(qpos, [(0, tiles * _TILE - count), (0, 0)], mode="edge")
-        found = lax.map(self._grasps, padded.reshape(tiles, _TILE, -1))
+        found = lax.map(lambda tile: self._found(tile, jnp), padded.reshape(tiles, _TILE, -1))
         return jax.tree.map(lambda x: x.reshape(tiles * _TILE, *x.shape[2:])[:count], found)
-
-    def _grasps(self, qpos: jax.Array) -> HandGrasps:
-        return self._found(qpos, jnp)
 
     def _found(self, qpos: Array | np.ndarray, xp: ModuleType) -> HandGrasps:
         """For (n, nq), by engine `mujoco` in NumPy, by `distance` in JAX's arrays."""
-        admissible = self._admissible(qpos, xp)
+        admissible = admissible_configurations(self.model, qpos, xp)
         safe = xp.where(admissible[:, None], qpos, self.model.qpos0.astype(qpos.dtype))
         geometry = self._engine.find(safe) if xp is np else self._distances.find(safe)
         found = self.rule.contacts(geometry.points, self.touching_links, xp)
@@ -355,6 +355,7 @@ class HandObject:
         moved = xp.asarray(self.moved_bodies)[found.link]
         frames = xp.asarray(contacts.frames)
         jacobian = self._mechanics.jacobians(geometry, found.position, moved, frames, rotation, xp)
+        weight = wrench_against_weight(self.model, bodies_below(self.model, self.object_body), rotation, xp)
         as_float_array = lambda x: jnp.asarray(x, jnp.result_type(float) if xp is np else qpos.dtype)  # noqa: E731
         return HandGrasps(
             contacts=contacts,
@@ -363,7 +364,7 @@ class HandObject:
             touching=jnp.asarray(found.touching),
             left_out=jnp.asarray(found.left_out),
             penetration=as_float_array(xp.maximum(0, -geometry.points.distance.min(-1))),
-            required_wrench=as_float_array(xp.where(admissible[:, None], self._weight(rotation, xp), np.nan)),
+            required_wrench=as_float_array(xp.where(admissible[:, None], weight, np.nan)),
             actuator_lengths=as_float_array(geometry.lengths),
             object_position=as_float_array(centre),
             object_rotation=as_float_array(rotation),
@@ -384,22 +385,6 @@ class HandObject:
     def kinematics(self) -> Kinematics:
         """Poses of all bodies, by JAX."""
         return self._distances.kinematics
-
-    def _weight(self, rotation: Array | np.ndarray, xp: ModuleType) -> Array | np.ndarray:
-        """What bears the object's weight, (n, 6), in the object's frame."""
-        mass, lever = weighing_mass(self.model, bodies_below(self.model, self.object_body))
-        gravity = xp.einsum("nji,j->ni", rotation, gravity_of(self.model).astype(rotation.dtype))
-        moment = xp.cross(lever.astype(rotation.dtype), gravity)
-        return -xp.concatenate([mass * gravity, moment], -1)
-
-    def _admissible(self, qpos: Array | np.ndarray, xp: ModuleType) -> Array | np.ndarray:
-        fine = xp.isfinite(qpos).all(-1)
-        for joint in np.flatnonzero(self.model.jnt_type == FREE):
-            start = self.model.jnt_qposadr[joint] + 3
-            squared = (qpos[:, start : start + 4] ** 2).sum(-1)
-            least, most = (1 - _QUATERNION_TOLERANCE) ** 2, (1 + _QUATERNION_TOLERANCE) ** 2
-            fine = fine & (squared >= least) & (squared <= most)
-        return fine
 
     def actuation_at(
         self, qpos: jax.Array, poses: Poses, world: jax.Array, rotation: jax.Array, frames: jax.Array, links: jax.Array
