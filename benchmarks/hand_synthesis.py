@@ -280,7 +280,7 @@ def main() -> None:
         with Progress() as progress:
             task = progress.add_task(f"grasping with {hand_name}", total=2 * len(OBJECTS))
             for seed, object in enumerate(OBJECTS):
-                hand, arms = HandObject.from_mjcf(HANDS[hand_name](object), "object"), {}
+                hand, arms = HandObject.from_mjcf(HANDS[hand_name](object), "object", contact_distance=1e-3), {}
                 for name in (SYNTHESISED, RANDOM):
                     count = starts * MORE[hand_name] if name == RANDOM else starts
                     arms[name] = measure(name, hand, count, seed, starts)

@@ -169,7 +169,7 @@ def parts(goal: Wanted, found: Squeezed) -> dict[str, np.ndarray]:
 def tightened(object: str) -> tuple[mujoco.MjSpec, Wanted, dict]:
     """The best candidates on an object, and how they were found."""
     spec = four_fingers(object)
-    hand = HandObject.from_mjcf(spec, "object")
+    hand = HandObject.from_mjcf(spec, "object", contact_distance=1e-3)
     qpos = sample_configurations(hand, SAMPLES)
     grasps = hand.grasps(qpos)
     pushes = jg.DisturbanceSet.forces(1.0)

@@ -24,7 +24,7 @@ MARGIN = 0.002
 def model_of(scene: str, name: str) -> mujoco.MjModel:
     """A built-in scene in which C finds contacts as exactly as it can, and near ones too."""
     spec = SCENES[scene](name)
-    spec.geom("object").margin = MARGIN
+    spec.geom("object").gap = MARGIN
     model = spec.compile()
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-12, 500
     # By default C adds points, beside the nearest, where flat sides lie on each other.
@@ -171,7 +171,7 @@ def case(scene: str, name: str) -> Case:
     """Computed once a process."""
     model = model_of(scene, name)
     qpos = near_contact(model, COUNT, seed=1)
-    hand = HandObject.from_mjcf(model, "object", contact_distance=0.0, max_contacts=SLOTS)
-    grasps = jax.tree.map(np.asarray, hand.grasps(qpos))
+    hand = HandObject.from_mjcf(model, "object", contact_distance=0.0, points_per_link=None, max_contacts=SLOTS)
+    grasps = jax.tree.map(np.asarray, hand.grasps(qpos, "distance"))
     slot = np.nonzero(np.isfinite(grasps.distances))[1]
     return Case(model, qpos, hand, grasps, ours(grasps), slot, by_mujoco(model, qpos))

@@ -60,18 +60,18 @@ COUPLED = """
 
 
 @cache
-def small(kind: str) -> tuple[HandObject, np.ndarray, HandGrasps]:
+def small(kind: str, engine: str = "distance") -> tuple[HandObject, np.ndarray, HandGrasps]:
     rest = {"kinds": KINDS, "spatial": SPATIAL, "coupled": COUPLED}[kind]
     links = hand_models.FINGER.replace('name="d" type="slide"', LIMITED)
     model = hand_models.finger(rest, links=links if kind == "kinds" else hand_models.FINGER)
-    hand = HandObject.from_mjcf(model, "object", max_contacts=4)
+    hand = HandObject.from_mjcf(model, "object", max_contacts=4, points_per_link=None, unreached="free")
     qpos = hand_models.random_configurations(model, COUNT)
-    return hand, qpos, jax.tree.map(np.asarray, hand.grasps(qpos))
+    return hand, qpos, jax.tree.map(np.asarray, hand.grasps(qpos, engine))
 
 
 def scene(kind: str) -> tuple[HandObject, np.ndarray, HandGrasps]:
     if kind != "shadow_hand":
-        return small(kind)
+        return small(*kind.split())
     this = case("shadow_hand", "sphere")
     return this.hand, this.qpos[:COUNT], jax.tree.map(lambda x: x[:COUNT], this.grasps)
 
@@ -92,7 +92,18 @@ def moments_of(data: mujoco.MjData) -> tuple[np.ndarray, ...]:
     return data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
 
 
-MODELS = ["kinds", *[pytest.param(kind, marks=pytest.mark.thorough) for kind in ("spatial", "shadow_hand")]]
+MODELS = ["kinds mujoco", "spatial mujoco", "coupled mujoco"]
+MODELS += [pytest.param(kind, marks=pytest.mark.thorough) for kind in ("kinds", "spatial", "shadow_hand")]
+
+
+def limits_of(hand: HandObject, grasps: HandGrasps) -> tuple[np.ndarray, np.ndarray]:
+    """Of the actuators alone, without springs."""
+    ends = (grasps.actuation.lower, grasps.actuation.upper)
+    return tuple(np.array(hand.actuator_efforts(grasps, end)) for end in ends)
+
+
+def coupling(hand: HandObject, qpos: np.ndarray) -> np.ndarray:
+    return np.asarray(hand.couplings.velocities(qpos[hand.model.jnt_qposadr[hand.joints]], np))
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -101,29 +112,40 @@ def test_efforts_and_commands_are_those_of_mujoco(kind):
     model, numbers = hand.model, [hand.model.actuator(name).id for name in hand.actuator_names]
     assert sorted(numbers) == list(range(model.nu))
     rng = np.random.default_rng(4)
-    lower, upper = np.asarray(grasps.actuation.lower), np.asarray(grasps.actuation.upper)
+    lower, upper = limits_of(hand, grasps)
     assert np.all(lower < upper)
-    efforts = rng.uniform(np.maximum(lower, -5), np.minimum(upper, 5))
+    own = rng.uniform(np.maximum(lower, -5), np.minimum(upper, 5))
+    efforts = np.array(grasps.spring_efforts)
+    efforts[:, : len(numbers)] += own
     commands = np.asarray(hand.controls(grasps, efforts))
     assert np.isfinite(commands).all()
     for lane in range(COUNT):
-        B = grasps.actuation.transmission[lane]
+        B, T = grasps.actuation.transmission[lane], coupling(hand, qpos[lane])
         data = commanded(model, numbers, qpos[lane], commands[lane])
         moment = np.zeros((model.nu, model.nv))
         mujoco.mju_sparse2dense(moment, *moments_of(data))
-        np.testing.assert_allclose(B, moment[np.ix_(numbers, hand.dofs)].T, atol=EXACT)
+        np.testing.assert_allclose(B[:, : len(numbers)], T.T @ moment[np.ix_(numbers, hand.dofs)].T, atol=EXACT)
         np.testing.assert_allclose(grasps.actuator_lengths[lane], data.actuator_length[numbers], atol=EXACT)
-        np.testing.assert_allclose(data.actuator_force[numbers], efforts[lane], atol=EXACT)
-        np.testing.assert_allclose(data.qfrc_actuator[hand.dofs], B @ efforts[lane], atol=EXACT)
+        np.testing.assert_allclose(data.actuator_force[numbers], own[lane], atol=EXACT)
+        # What joints bear by themselves is among the efforts: the springs' torques.
+        np.testing.assert_allclose(grasps.spring_torques[lane], T.T @ data.qfrc_spring[hand.dofs], atol=EXACT)
+        every = np.where(np.arange(B.shape[1]) < len(numbers), efforts[lane], grasps.actuation.lower[lane])
+        if not np.isfinite(every).all() or B.shape[1] == len(numbers):
+            every = efforts[lane]
+        reached = B @ np.linalg.pinv(B)
+        wanted = T.T @ (data.qfrc_actuator + data.qfrc_spring)[hand.dofs]
+        np.testing.assert_allclose(reached @ wanted, B @ every, atol=EXACT)
 
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_limits_are_those_of_mujoco(kind):
     hand, qpos, grasps = scene(kind)
     model, numbers = hand.model, [hand.model.actuator(name).id for name in hand.actuator_names]
-    lower, upper = np.asarray(grasps.actuation.lower), np.asarray(grasps.actuation.upper)
+    lower, upper = limits_of(hand, grasps)
     middle = 0.5 * (np.maximum(lower, -5) + np.minimum(upper, 5))
-    commands = np.asarray(hand.controls(grasps, middle))
+    efforts = np.array(grasps.spring_efforts)
+    efforts[:, : len(numbers)] += middle
+    commands = np.asarray(hand.controls(grasps, efforts))
     checked = 0
     for lane in range(5):
         for column, number in enumerate(numbers):
@@ -133,13 +155,14 @@ def test_limits_are_those_of_mujoco(kind):
                 # Activations are limited where they are integrated alone.
                 stateful = model.actuator_actnum[number] > 0
                 ctrl[column] = np.clip(command, *model.actuator_actrange[number]) if stateful else command
-                reached.append(commanded(model, numbers, qpos[lane], ctrl).qfrc_actuator[hand.dofs])
+                torque = commanded(model, numbers, qpos[lane], ctrl).qfrc_actuator[hand.dofs]
+                reached.append(coupling(hand, qpos[lane]).T @ torque)
             ends = []
             for limit in (lower, upper):
                 u = middle[lane].copy()
                 u[column] = limit[lane, column]
                 if np.isfinite(u).all():
-                    ends.append(grasps.actuation.transmission[lane] @ u)
+                    ends.append(grasps.actuation.transmission[lane][:, : len(numbers)] @ u)
                 else:
                     assert max(np.abs(r).max() for r in reached) > 1e6
             checked += len(ends)

@@ -54,7 +54,7 @@ def check(function, qpos: np.ndarray, step: float, seed: int = 0) -> None:
 @pytest.mark.thorough
 def test_contacts():
     model = finger('<actuator><position joint="b" kp="2"/></actuator>', objects=PARTS)
-    hand = HandObject.from_mjcf(model, "object", contact_distance=0.0, max_contacts=6)
+    hand = HandObject.from_mjcf(model, "object", contact_distance=0.0, points_per_link=None, max_contacts=6)
 
     def outputs(qpos):
         grasps = hand.grasps(qpos)

@@ -18,6 +18,7 @@ from jaxgrasp.hands import HandObject
 
 EXACT = 1e-9
 COUNT = 200
+ENGINES = ("mujoco", "distance")
 # Two geoms, a centre of mass off the origin, a part that is fixed to it and turned.
 PARTS = """
 <body name="object" pos="0.0 0 0">
@@ -33,19 +34,20 @@ PARTS = """
 @cache
 def composite() -> tuple[HandObject, np.ndarray]:
     model = finger(objects=PARTS)
-    return HandObject.from_mjcf(model, "object", contact_distance=0.0, max_contacts=12), random_configurations(
-        model, COUNT
-    )
+    options = {"contact_distance": 0.0, "points_per_link": None, "max_contacts": 12}
+    return HandObject.from_mjcf(model, "object", **options), random_configurations(model, COUNT)
 
 
-def grasps_of_parts():
+@cache
+def grasps_of_parts(engine: str = "distance"):
     hand, qpos = composite()
-    return jax.tree.map(np.asarray, hand.grasps(qpos))
+    return jax.tree.map(np.asarray, hand.grasps(qpos, engine))
 
 
-def test_contacts_of_an_object_of_several_parts():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_contacts_of_an_object_of_several_parts(engine):
     hand, qpos = composite()
-    theirs, found = configurations.by_mujoco(hand.model, qpos), configurations.ours(grasps_of_parts())
+    theirs, found = configurations.by_mujoco(hand.model, qpos), configurations.ours(grasps_of_parts(engine))
     for of, among, counted in ((theirs, found, slice(None)), (found, theirs, found.distance < 0)):
         position, normal, distance, at = configurations.differences(of, among)
         assert len(position[counted]) > COUNT // 2
@@ -54,9 +56,10 @@ def test_contacts_of_an_object_of_several_parts():
     assert {1.0, 1.4} == set(theirs.friction)
 
 
-def test_required_wrench_is_what_holds_the_object():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_required_wrench_is_what_holds_the_object(engine):
     hand, qpos = composite()
-    grasps = grasps_of_parts()
+    grasps = grasps_of_parts(engine)
     model, data = hand.model, mujoco.MjData(hand.model)
     body = model.body("object").id
     free = model.jnt_dofadr[model.body("object").jntadr[0]] + np.arange(6)
@@ -74,9 +77,10 @@ def test_required_wrench_is_what_holds_the_object():
     assert np.abs(grasps.required_wrench[:, :3]).max() > 1
 
 
-def test_bad_configurations_are_alone():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_bad_configurations_are_alone(engine):
     hand, qpos = composite()
-    whole = grasps_of_parts()
+    whole = grasps_of_parts(engine)
     bad = qpos.copy()
     start = hand.model.jnt_qposadr[hand.model.body("object").jntadr[0]] + 3
     bad[3, 0], bad[5, start + 1], bad[8] = np.nan, np.inf, np.nan
@@ -85,7 +89,7 @@ def test_bad_configurations_are_alone():
     # Rounding is no mistake.
     bad[13, start : start + 4] *= 1 + 1e-6
     wrong = np.isin(np.arange(COUNT), [3, 5, 8, 11, 12])
-    found = jax.tree.map(np.asarray, hand.grasps(bad))
+    found = jax.tree.map(np.asarray, hand.grasps(bad, engine))
     same = jax.tree.map(lambda a, b: np.array_equal(a[~wrong][14:], b[~wrong][14:]), found, whole)
     assert all(jax.tree.leaves(same))
     np.testing.assert_allclose(found.contacts.positions[13], whole.contacts.positions[13], atol=1e-7)
@@ -105,9 +109,9 @@ def test_batches_of_any_shape():
             for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(wanted), strict=True):
                 np.testing.assert_allclose(a, b[indices].reshape((*shape, *b.shape[1:])), rtol=1e-12, atol=1e-12)
 
-    same(hand.grasps(qpos[0]), slice(1), ())
-    same(hand.grasps(qpos[:1]), slice(1), (1,))
-    same(hand.grasps(qpos[:6].reshape(3, 1, 2, -1)), slice(6), (3, 1, 2))
+    same(hand.grasps(qpos[0], "distance"), slice(1), ())
+    same(hand.grasps(qpos[:1], "distance"), slice(1), (1,))
+    same(hand.grasps(qpos[:6].reshape(3, 1, 2, -1), "distance"), slice(6), (3, 1, 2))
     same(jax.jit(jax.vmap(hand.grasps))(qpos[:6]), slice(6), (6,))
 
 
@@ -117,41 +121,66 @@ def test_the_nearest_contacts_are_kept():
     few = jax.tree.map(
         np.asarray,
         HandObject.from_mjcf(
-            hand.model, "object", contact_distance=0.0, max_contacts=2, friction=0.3, max_force=7.0
-        ).grasps(qpos),
+            hand.model,
+            "object",
+            contact_distance=0.0,
+            points_per_link=None,
+            max_contacts=2,
+            friction=0.3,
+            max_force=7.0,
+        ).grasps(qpos, "distance"),
     )
     assert few.distances.shape == (COUNT, 2)
     assert np.array_equal(few.distances, whole.distances[:, :2])
     assert np.array_equal(few.touching, whole.touching) and few.touching.max() > 2
+    assert np.array_equal(few.left_out, np.maximum(whole.touching - 2, 0))
     assert np.array_equal(few.penetration, np.maximum(0, -whole.distances[:, 0]))
     assert np.all(few.contacts.friction == 0.3) and np.all(few.contacts.max_force == 7.0)
 
 
-def test_points_on_a_link_become_one():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_link_has_one_contact_at_the_mean_of_its_points(engine):
     hand, qpos = composite()
-    whole = grasps_of_parts()
-    reach = 0.01
-    merged = jax.tree.map(
+    whole = jax.tree.map(
         np.asarray,
-        HandObject.from_mjcf(hand.model, "object", contact_distance=0.0, max_contacts=12, merge=reach).grasps(qpos),
+        HandObject.from_mjcf(hand.model, "object", contact_distance=2e-3, points_per_link=None, max_contacts=16).grasps(
+            qpos, engine
+        ),
     )
-    assert merged.distances.shape[1] == 4
+    merged = jax.tree.map(
+        np.asarray, HandObject.from_mjcf(hand.model, "object", contact_distance=2e-3).grasps(qpos, engine)
+    )
+    assert merged.distances.shape[1] == 4 and not merged.left_out.any()
     several = 0
-    for lane in range(COUNT):
-        for slot, link in enumerate(merged.links[lane]):
-            own = whole.links[lane] == link
-            distances, points = whole.distances[lane][own], whole.contacts.positions[lane][own]
-            assert merged.distances[lane, slot] == distances[0]
-            counted = (np.linalg.norm(points - points[0], axis=-1) <= reach) & (distances <= 0)
-            counted[0] = True
-            several += counted.sum() > 1
-            np.testing.assert_allclose(merged.contacts.positions[lane, slot], points[counted].mean(0), atol=1e-12)
-            normal = whole.contacts.frames[lane][own][counted][:, :, 2].mean(0)
-            np.testing.assert_allclose(
-                merged.contacts.frames[lane, slot, :, 2], normal / np.linalg.norm(normal), atol=1e-12
-            )
+    for lane, slot in zip(*np.nonzero(merged.contacts.active), strict=True):
+        own = (whole.links[lane] == merged.links[lane, slot]) & whole.contacts.active[lane]
+        assert merged.distances[lane, slot] == whole.distances[lane][own].min()
+        assert merged.contacts.friction[lane, slot] == whole.contacts.friction[lane][own].min()
+        several += own.sum() > 1
+        normal = whole.contacts.frames[lane][own][:, :, 2].mean(0)
+        for got, wanted in (
+            (merged.contacts.positions[lane, slot], whole.contacts.positions[lane][own].mean(0)),
+            (merged.contacts.frames[lane, slot, :, 2], normal / np.linalg.norm(normal)),
+        ):
+            np.testing.assert_allclose(got, wanted, atol=1e-12)
     assert several > 5
-    assert np.array_equal(merged.contacts.active, merged.distances <= 0)
+    links = [len(set(row[active])) for row, active in zip(whole.links, whole.contacts.active, strict=True)]
+    np.testing.assert_array_equal(merged.touching, links)
+    np.testing.assert_array_equal(merged.contacts.active.sum(-1), links)
+
+
+def test_no_distance_is_known_of_a_plane_but_mujoco_knows_one():
+    plane = OBJECT.replace('type="sphere" size="0.012"', PLANE).replace("<freejoint/>", "")
+    model = finger(objects=plane)
+    hand = HandObject.from_mjcf(model, "object")
+    message = r"geoms number 0 \(sphere\) and 'floor' \(plane\) can touch, but no distance .*or engine 'mujoco'$"
+    with pytest.raises(ValueError, match=message):
+        hand.grasps(model.qpos0, "distance")
+    assert hand.grasps(model.qpos0).touching == 4
+    with pytest.raises(ValueError, match=r"^engine: got 'mujoco' inside jit"):
+        jax.jit(lambda q: hand.grasps(q, "mujoco"))(model.qpos0)
+    with pytest.raises(ValueError, match=r"^engine: got 'bullet', wanted one of mujoco, distance"):
+        hand.grasps(model.qpos0, "bullet")
 
 
 FIXED = (
@@ -173,13 +202,15 @@ PLANE = 'name="floor" type="plane" size="1 1 1"'
         ({}, {"max_force": np.inf}, r"^max_force: got inf, wanted a finite positive number"),
         ({}, {"contact_distance": np.nan}, r"^contact_distance: got nan"),
         ({}, {"friction": -0.5}, r"^friction: got -0.5, wanted a finite number, at least 0"),
-        ({}, {"merge": -1.0}, r"^merge: got -1.0"),
+        ({}, {"points_per_link": 0}, r"^points_per_link: got 0, wanted at least 1"),
+        ({}, {"unreached": "loose"}, r"^unreached: got 'loose', wanted one of held, free"),
+        ({"links": FINGER.replace("stiffness", "damping")}, {"unreached": "free"},
+         r"^unreached: got 'free' for a hand without actuators"),
+        ({}, {"environment": ["table"]}, r"^environment: got 'table', wanted one of the scene's bodies"),
         ({"links": FINGER.replace('conaffinity="2"', 'conaffinity="0"').replace('contype="1"', 'contype="0"')}, {},
          r"no geom of the hand can touch .*wanted contype and conaffinity"),
         ({"links": FINGER.replace('name="a" axis="0 0 1"', 'name="a" type="ball"')}, {},
          r"joint 'a' is a ball; wanted hinges"),
-        ({"objects": OBJECT.replace('type="sphere" size="0.012"', PLANE).replace("<freejoint/>", "")}, {},
-         r"geoms number 0 \(sphere\) and 'floor' \(plane\) can touch, but no distance .*wanted sphere, "),
         ({"objects": OBJECT.replace("</body>", '<body><joint/><geom size="0.01"/></body></body>')}, {},
          r"^object_body: got 'object', with joints inside"),
         ({"rest": FIXED + '<equality><tendon name="bound" tendon1="t" tendon2="s"/></equality>'}, {},

@@ -9,7 +9,8 @@ from scipy import stats
 
 import jaxgrasp as jg
 from jaxgrasp.cli import main
-from jaxgrasp.cli.scene import HandScene, Scene
+from jaxgrasp.cli.hand_scene import HandScene
+from jaxgrasp.cli.scene import Scene
 from jaxgrasp.compiling import compiled
 from jaxgrasp.hands import HandObject, scenes
 from jaxgrasp.hands.self_collision import self_pairs
@@ -24,7 +25,8 @@ STARTS, STEPS = 32, 80
 
 @pytest.fixture(scope="module")
 def hand():
-    return HandObject.from_mjcf(scenes.four_fingers("sphere"), "object")
+    # Fingers are closed until they touch: no file's gaps count.
+    return HandObject.from_mjcf(scenes.four_fingers("sphere"), "object", contact_distance=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -259,12 +261,12 @@ def test_what_cannot_be_used_is_named(hand, options, named):
 def test_the_command_writes_what_rank_reads(hand, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # The same hand, for which everything is compiled.
-    monkeypatch.setattr(HandScene, "hand", lambda *_: hand)
+    monkeypatch.setattr(HandScene, "hand_object", lambda *_: hand)
     command = ["synthesize", "--scene", "four_fingers", "--starts", "32", "--steps", "80", "--disturbances", "forces"]
     assert main([*command, "--keep", "6", "--picture", "None"]) == 0
     assert "synthesised" in capsys.readouterr().out
     scene = Scene(scene="four_fingers", qpos=tmp_path / "grasps.npz")
-    qpos, columns = scene._read(scene.hand(None, None))
+    qpos, columns = scene._read(scene.hand_object(None, None))
     assert len(qpos) == 6 and set(columns) >= {"pregrasp_qpos", "squeeze_qpos", "squeeze_controls", "synthesis_margin"}
     assert (tmp_path / "synthesis.png").stat().st_size > 20_000
 

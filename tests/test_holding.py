@@ -20,7 +20,7 @@ ANCHORED = 1e-4
 
 @pytest.fixture(scope="module")
 def hand() -> HandObject:
-    return HandObject.from_mjcf(four_fingers("sphere"), "object")
+    return HandObject.from_mjcf(four_fingers("sphere"), "object", contact_distance=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def grasp(hand) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     qpos[:12] = np.tile(BENT, 4)
     qpos = np.asarray(close_fingers(hand, qpos))
     grasps = hand.grasps(qpos)
-    forces = np.zeros((hand.max_contacts, 3))
+    forces = np.zeros((*grasps.distances.shape, 3))
     forces[np.asarray(grasps.contacts.active), 2] = -PRESS
     # Each joint has one actuator, in the same order.
     efforts = np.asarray(grasps.actuation.joint_torques(forces))

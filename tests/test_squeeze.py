@@ -26,7 +26,7 @@ SAMPLES, BEST = 64, 12
 
 @pytest.mark.thorough
 def test_a_simulated_hand_squeezes_as_told():
-    hand = HandObject.from_mjcf(four_fingers("sphere"), "object")
+    hand = HandObject.from_mjcf(four_fingers("sphere"), "object", contact_distance=1e-3)
     qpos = sample_configurations(hand, SAMPLES)
     grasps = hand.grasps(qpos)
     # The forces of (21) instead of (22)'s: all that they have to be is admissible, and this compiles in half the time.

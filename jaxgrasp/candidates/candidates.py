@@ -129,6 +129,7 @@ def concatenate(parts: Sequence[Candidates]) -> Candidates:
         max_force=join([part.max_force for part in parts], 1.0),
         active=join([part.active for part in parts], False),
         mass=np.concatenate([part.mass for part in parts]),
+        hand={name: np.concatenate([part.hand[name] for part in parts]) for name in parts[0].hand},
         columns={name: _joined_column(name, parts) for name in names},
         sources=tuple(source for part in parts for source in part.sources),
         source=np.concatenate([part.source + offset for part, offset in zip(parts, offsets, strict=False)]),

@@ -3,15 +3,16 @@
 import csv
 import io
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.problems import CommandError, check_output, warn_of_conventions, write_files
+from jaxgrasp.cli.scene import ComparedScene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import printing
 from jaxgrasp.storage import atomic_write
@@ -36,13 +37,14 @@ DEFAULT = (
 class Compare(Reading):
     """Compare metrics on the same grasps: how alike they rank them, and how well they predict success.
 
-    Reads the files that `jaxgrasp rank` reads, computes metrics, and writes a table and a figure of Spearman's rank
-    correlations. Where the files have a column that says which grasps succeeded, ROC curves and the areas under them
-    come along, with 95 % bootstrap intervals. A grasp without an answer counts as the worst.
+    Reads the files that `jaxgrasp rank` reads, or takes a hand, an object and grasps as `rank` does, computes metrics,
+    and writes a table and a figure of Spearman's rank correlations. Where the files have a column that says which
+    grasps succeeded, ROC curves and the areas under them come along, with 95 % bootstrap intervals. A grasp without an
+    answer counts as the worst.
     """
 
-    files: tyro.conf.Positional[tuple[Path, ...]]
-    """Files of candidates, .npz."""
+    files: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Files of candidates, .npz; none with a hand."""
 
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Metrics to compare, NAME[,NAME...]; all that take batches without any. A wrong name is answered with all
@@ -53,7 +55,7 @@ class Compare(Reading):
 
     success: str | None = None
     """The column that says which grasps succeeded, of booleans or of 0 and 1. None takes a boolean one whose name has
-    "success" in it, where there is one."""
+    "succ" in it, where there is one."""
 
     within: str | None = None
     """A column of labels, object_name for example: areas then count only pairs of grasps with the same label, so that
@@ -86,6 +88,8 @@ class Compare(Reading):
     figure: Path | None = Path("comparison.png")
     """The figure to write, .png, .svg or .pdf; None for no figure."""
 
+    of_hand: Annotated[ComparedScene, tyro.conf.arg(name="")] = field(default_factory=ComparedScene)
+
     def run(self) -> int:
         """Computes, writes and prints.
 
@@ -108,12 +112,16 @@ class Compare(Reading):
 
         try:
             disturbances, _ = named_disturbances(self.disturbances)
-            candidates = read_candidates(
-                self.files, friction=self.friction, max_force=self.max_force, with_mass=self.gravity != 0.0
-            )
+            if self.of_hand.given:
+                candidates, _ = self.of_hand.candidates(self.friction, self.max_force)
+            else:
+                candidates = read_candidates(
+                    self.files, friction=self.friction, max_force=self.max_force, with_mass=self.gravity != 0.0
+                )
         except CandidateError as error:
             raise CommandError(str(error)) from error
-        warn_of_conventions(candidates)
+        if not self.of_hand.given:
+            warn_of_conventions(candidates)
         outcome, success = self._success(candidates)
         stored = {name: self._column(candidates, name, "--columns", "biuf").astype(float) for name in self.columns}
         within = self._column(candidates, self.within, "--within", "biufU") if self.within else None
@@ -143,12 +151,15 @@ class Compare(Reading):
             ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
             ("--resamples", self.resamples, self.resamples >= 1, "at least 1"),
             ("--seed", self.seed, self.seed >= 0, "a number >= 0"),
-            ("FILES", "none", bool(self.files), "at least one file of candidates"),
+            ("FILES", "none", bool(self.files) or self.of_hand.given, "at least one file of candidates, or a hand"),
         ]
         for option, value, admissible, wanted in checks:
             if not admissible:
                 raise CommandError(f"{option}: got {value}; wanted {wanted}")
-        inputs = [*self.files, Path(self.disturbances)]
+        self.of_hand.check()
+        if self.of_hand.given and (self.files or self.gravity):
+            raise CommandError("--hand or --scene: got FILES or --gravity, too; wanted the scene's own alone")
+        inputs = [*self.files, Path(self.disturbances), Path(self.of_hand.name), *self.of_hand.grasps]
         for option, path, endings in (("--output", self.output, (".csv",)), ("--figure", self.figure, FIGURE_ENDINGS)):
             if path is not None:
                 check_output(path, option, endings, inputs)
@@ -159,7 +170,7 @@ class Compare(Reading):
             fitting = [
                 key
                 for key, column in candidates.columns.items()
-                if "success" in key and column.dtype == bool and column.ndim == 1
+                if "succ" in key and column.dtype == bool and column.ndim == 1
             ]
             if not fitting:
                 return "success", None

@@ -31,8 +31,8 @@ class Rank(Reading):
 
     Reads .npz files with positions (N, n_c, 3), in m about the centre of mass, and outward_normals (N, n_c, 3) or
     frames (N, n_c, 3, 3), and where present friction, max_force, mass, center_of_mass and active; other columns travel
-    along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object. With --scene the
-    candidates are configurations of a hand.
+    along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object. With --scene, or
+    with --hand, --object and --grasps, the candidates are configurations of a hand.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -94,18 +94,21 @@ class Rank(Reading):
         from jaxgrasp.cli.report import Clock
 
         clock = Clock()
-        hand = self.of_hand.hand(self.friction, self.max_force) if self.of_hand.scene else None
+        hands: list[HandObject] = []
         try:
             disturbances, unit = named_disturbances(self.disturbances)
-            candidates = self._candidates() if hand is None else self.of_hand.candidates(hand)
+            if self.of_hand.given:
+                candidates, hands = self.of_hand.candidates(self.friction, self.max_force)
+            else:
+                candidates = self._candidates()
         except CandidateError as error:
             raise CommandError(str(error)) from error
-        if hand is None:
+        if not self.of_hand.given:
             warn_of_conventions(candidates)
         clock.lap()
         metrics = scores_of(candidates, names, disturbances, gravity=self.gravity, cone_edges=self.cone_edges)
         clock.lap("metrics" if metrics else "")
-        return self._rank(candidates, disturbances, unit, hand, metrics, clock)
+        return self._rank(candidates, disturbances, unit, hands, metrics, clock)
 
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
@@ -121,14 +124,21 @@ class Rank(Reading):
         if self.prune and self.metric:
             raise CommandError("--prune: got --metric, too; wanted a ranking by the margin alone")
         self.of_hand.check()
-        if self.of_hand.scene and (self.files or self.gravity):
+        if self.of_hand.given and (self.files or self.gravity):
             what = "files of contacts" if self.files else "--gravity"
-            raise CommandError(f"--scene: got {what}, too; wanted the scene's own contacts and gravity alone")
-        inputs = [*self.files, Path(self.disturbances), Path(self.of_hand.scene or ""), self.of_hand.qpos or Path()]
+            option = "--scene" if self.of_hand.scene else "--hand"
+            raise CommandError(f"{option}: got {what}, too; wanted the scene's own contacts and gravity alone")
+        inputs = [
+            *self.files,
+            Path(self.disturbances),
+            Path(self.of_hand.name),
+            self.of_hand.qpos or Path(),
+            *self.of_hand.grasps,
+        ]
         for option, path, endings in (
             ("--output", self.output, TABLE_ENDINGS),
             ("--figure", self.figure, FIGURE_ENDINGS),
-            ("--picture", self.of_hand.picture if self.of_hand.scene else None, FIGURE_ENDINGS),
+            ("--picture", self.of_hand.picture if self.of_hand.given else None, FIGURE_ENDINGS),
         ):
             if path is not None:
                 check_output(path, option, endings, inputs)
@@ -151,7 +161,7 @@ class Rank(Reading):
         candidates: "Candidates",
         disturbances: "DisturbanceSet",
         unit: str,
-        hand: "HandObject | None",
+        hands: "list[HandObject]",
         metrics: dict[str, np.ndarray],
         clock: "Clock",
     ) -> int:
@@ -181,7 +191,7 @@ class Rank(Reading):
                 one_line(complaint)
                 return exit_code
         clock.lap()
-        written, failed = self._write(ranking, unit, hand)
+        written, failed = self._write(ranking, unit, hands)
         zeros = self._why_zero(ranking, disturbances)
         if complaint:
             one_line(complaint)
@@ -200,7 +210,7 @@ class Rank(Reading):
             cone_edges=self.cone_edges,
         )
 
-    def _write(self, ranking: "Ranking", unit: str, hand: "HandObject | None") -> tuple[list[Path], bool]:
+    def _write(self, ranking: "Ranking", unit: str, hands: "list[HandObject]") -> tuple[list[Path], bool]:
         from jaxgrasp.ranking import write_table
         from jaxgrasp.viewer import figure_of_ranking, write_figure
 
@@ -210,8 +220,8 @@ class Rank(Reading):
         written, failed = write_files(
             (self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture)
         )
-        if hand is not None and np.isfinite(ranking.effort).any():
+        if hands and np.isfinite(ranking.effort).any():
             # Many machines have nothing to render with: that is told, and no failure.
-            drawn, _ = write_files((self.of_hand.picture, lambda path: self.of_hand.draw(hand, ranking, unit, path)))
+            drawn, _ = write_files((self.of_hand.picture, lambda path: self.of_hand.draw(hands, ranking, unit, path)))
             written += drawn
         return written, failed

@@ -1,4 +1,4 @@
-"""The options by which `jaxgrasp rank` takes a hand and an object from MJCF, and candidates from joint angles."""
+"""The options by which `jaxgrasp rank` and `compare` take candidates from configurations of a hand."""
 
 import math
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxgrasp.cli.hand_scene import HandScene
 from jaxgrasp.cli.problems import CommandError, check_options
 from jaxgrasp.cli.streams import one_line
 from jaxgrasp.storage import FileError, read_archive, read_array
@@ -16,93 +17,31 @@ if TYPE_CHECKING:
     from jaxgrasp.hands import HandObject
     from jaxgrasp.ranking import Ranking
 
-BUILT_IN = ("shadow_hand", "four_fingers")
 SAMPLED = 2_000
 _PICTURES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandScene:
-    """A hand and an object."""
-
-    scene: str | None = None
-    """A hand and an object in MJCF: a file, or shadow_hand or four_fingers, which come with the package."""
-
-    object_body: str = "object"
-    """The object's body in the scene."""
-
-    object_shape: str = "sphere"
-    """The object of a scene that comes with the package: sphere, capsule, box, cylinder, ellipsoid, mesh, or a FILE."""
-
-    contact_distance: float = 1e-3
-    """Geoms no farther apart than this touch, m."""
-
-    max_contacts: int = 8
-    """How many contacts a grasp keeps, the nearest ones."""
-
-    picture: Path | None = Path("hands.png")
-    """The rendered picture of the best configurations to write, .png; None for none."""
-
-    def check(self) -> None:
-        """Finds what cannot be used before any long work.
-
-        Raises:
-            CommandError: An option cannot be used.
-        """
-        check_options(
-            ("--contact-distance", self.contact_distance, 0.0 <= self.contact_distance < math.inf, "metres >= 0"),
-            ("--max-contacts", self.max_contacts, self.max_contacts >= 1, "at least 1"),
-        )
-
-    @property
-    def built_in(self) -> bool:
-        """Whether the scene comes with the package."""
-        return self.scene in BUILT_IN
-
-    def hand(self, friction: float | None, max_force: float | None) -> "HandObject":
-        """Reads the scene.
-
-        Args:
-            friction: Of all contacts; None is MuJoCo's.
-            max_force: Of every contact, N.
-
-        Raises:
-            CommandError: It cannot be used.
-        """
-        from jaxgrasp.hands import HandObject, scenes
-
-        assert self.scene is not None
-        try:
-            given = getattr(scenes, self.scene)(self.object_shape) if self.built_in else Path(self.scene)
-            return HandObject.from_mjcf(
-                given,
-                self.object_body,
-                contact_distance=self.contact_distance,
-                max_contacts=self.max_contacts,
-                friction=friction,
-                max_force=10.0 if max_force is None else max_force,
-            )
-        except (ValueError, OSError) as error:
-            raise CommandError(f"--scene {self.scene}: {' '.join(str(error).split())}") from error
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene(HandScene):
-    """A hand and an object, whose candidates are configurations."""
+class GivenScene(HandScene):
+    """A hand and an object, whose candidates are configurations of files."""
 
     scene: str | None = None
     """Rank configurations of a hand: an MJCF file with a hand and an object, or shadow_hand or four_fingers, which come
     with the package. The weight in the scene's gravity must be borne."""
 
+    object: str | None = None
+    """With --hand: a folder of convex pieces, a mesh, an MJCF or URDF file, or sphere, capsule, box, cylinder or
+    ellipsoid, 1 m wide along x."""
+
+    scale: float | None = None
+    """With --hand: of the object's lengths; None is the grasps' own obj_scale, or 1."""
+
+    grasps: tuple[Path, ...] = ()
+    """With --hand: files of grasps, .npz: grasp_qpos (N, 7 + n), pose of the base and joints, and where present
+    obj_pose (N, 7), obj_scale (N,) and joint_names; other columns travel along."""
+
     qpos: Path | None = None
-    """Configurations: .npy (N, nq), or .npz with the field qpos; other columns travel along. None samples them around
-    the scene's own: the object turned and moved, the fingers closed until they touch."""
-
-    samples: int = SAMPLED
-    """How many configurations to sample."""
-
-    seed: int = 0
-    """Of the samples."""
+    """With --scene: configurations, .npy (N, nq), or .npz with the field qpos; other columns travel along."""
 
     min_contacts: int = 2
     """Leave out configurations with fewer contacts."""
@@ -119,50 +58,60 @@ class Scene(HandScene):
         Raises:
             CommandError: An option cannot be used.
         """
-        if self.scene is None:
+        if not self.given:
             if self.qpos is not None:
                 raise CommandError("--qpos: got a file without --scene; wanted the scene that it is for, too")
+            if self.grasps or self.object:
+                raise CommandError("--grasps or --object: got no --hand; wanted the hand that they are for, too")
             return
         super().check()
+        if self.hand and (self.object is None or not self.grasps):
+            raise CommandError("--hand: got no --object or no --grasps; wanted both")
+        if self.scene and (self.grasps or self.object or self.scale is not None):
+            raise CommandError("--scene: got --grasps, --object or --scale, too; wanted --hand for these")
+        if self.hand and self.qpos is not None:
+            raise CommandError("--qpos: got --hand, too; wanted --grasps")
         check_options(
-            ("--samples", self.samples, self.samples >= 1, "at least 1"),
+            ("--scale", self.scale, self.scale is None or 0.0 < self.scale < math.inf, "a number > 0"),
             ("--min-contacts", self.min_contacts, self.min_contacts >= 0, "a number >= 0"),
             ("--max-penetration", self.max_penetration, self.max_penetration >= 0.0, "metres >= 0"),
         )
 
-    def candidates(self, hand: "HandObject") -> "Candidates":
+    def candidates(self, friction: float | None, max_force: float | None) -> "tuple[Candidates, list[HandObject]]":
         """Reads or samples the configurations, finds their contacts and leaves out what the options say.
 
+        Returns:
+            The candidates, and the scenes that they are of: the column `scene` says which.
+
         Raises:
-            CommandError: The file cannot be used, or no configuration is left.
+            CommandError: The files or the scene cannot be used, or no configuration is left.
         """
+        from jaxgrasp.cli.hand_grasps import candidates_of_grasps
         from jaxgrasp.cli.report import counting_bar
-        from jaxgrasp.ranking.configurations import candidates_of, kept
+        from jaxgrasp.ranking.configurations import candidates_of, kept, trimmed
 
-        columns: dict[str, np.ndarray] = {}
-        if self.actuators and not len(hand.actuators):
-            print("jaxgrasp: the hand has no actuators: every contact may push with --max-force", file=sys.stderr)
-        if self.qpos is None:
-            from jaxgrasp.hands import sample_configurations
-
-            with counting_bar("closing fingers", self.samples) as progress:
-                qpos = sample_configurations(hand, self.samples, self.seed, progress)
+        if self.hand:
+            found, hands = candidates_of_grasps(self, friction, max_force)
         else:
-            qpos, columns = self._read(hand)
-        with counting_bar("finding contacts", len(qpos)) as progress:
-            found = candidates_of(
-                hand,
-                qpos,
-                source=self.scene if self.qpos is None else str(self.qpos),
-                limited=self.actuators and len(hand.actuators) > 0,
-                columns=columns,
-                progress=progress,
-            )
+            hands = [self.hand_object(friction, max_force)]
+            columns: dict[str, np.ndarray] = {}
+            qpos, columns = (self._sampled(hands[0]), columns) if self.qpos is None else self._read(hands[0])
+            with counting_bar("finding contacts", len(qpos)) as progress:
+                found = candidates_of(
+                    hands[0],
+                    qpos,
+                    source=self.name if self.qpos is None else str(self.qpos),
+                    limited=self.actuators,
+                    columns=columns,
+                    engine=self.engine,
+                    progress=progress,
+                )
+        self._tell(found)
         left = kept(found, self.min_contacts, self.max_penetration)
         touching = found.columns["touching"]
         if not left.any():
             raise CommandError(
-                f"--scene {self.scene}: none of {len(qpos):,} configurations has {self.min_contacts} contacts and less "
+                f"{self.name}: none of {len(found):,} configurations has {self.min_contacts} contacts and less "
                 f"than {1e3 * self.max_penetration:g} mm of penetration (the most contacts are {touching.max()}, the "
                 f"least penetration is {1e3 * found.columns['penetration'].min():.3g} mm); wanted fingers that touch, "
                 "or other --contact-distance, --min-contacts, --max-penetration"
@@ -171,10 +120,24 @@ class Scene(HandScene):
         deep = int((found.columns["penetration"] > self.max_penetration).sum())
         if not left.all():
             one_line(
-                f"left out {int((~left).sum()):,} of {len(qpos):,} configurations: {few:,} with fewer than "
+                f"left out {int((~left).sum()):,} of {len(found):,} configurations: {few:,} with fewer than "
                 f"{self.min_contacts} contacts, {deep:,} deeper than {1e3 * self.max_penetration:g} mm"
             )
-        return found.take(np.flatnonzero(left))
+        return trimmed(found.take(np.flatnonzero(left))), hands
+
+    def _sampled(self, hand: "HandObject") -> np.ndarray:
+        raise CommandError("--scene: got no --qpos; wanted configurations of it")
+
+    def _tell(self, found: "Candidates") -> None:
+        """Says how contacts were made, and what --max-contacts left out."""
+        points = "one contact" if self.points_per_link == 1 else f"up to {self.points_per_link} contacts"
+        one_line(f"{points} for each link within {1e3 * self.contact_distance:g} mm of the object")
+        out = found.columns["left_out"]
+        if out.any():
+            one_line(
+                f"--max-contacts {self.max_contacts} leaves out links of {int((out > 0).sum()):,} configurations, "
+                f"{int(out.max())} at most"
+            )
 
     def _read(self, hand: "HandObject") -> tuple[np.ndarray, dict[str, np.ndarray]]:
         assert self.qpos is not None
@@ -193,7 +156,7 @@ class Scene(HandScene):
                 raise CommandError(f"{self.qpos}: {name}: got shape {column.shape}; wanted ({len(qpos)}, ...)")
         return np.asarray(qpos, float), columns
 
-    def draw(self, hand: "HandObject", ranking: "Ranking", unit: str, path: Path) -> None:
+    def draw(self, hands: "list[HandObject]", ranking: "Ranking", unit: str, path: Path) -> None:
         """Renders the best configurations with their tightening forces.
 
         Raises:
@@ -201,12 +164,62 @@ class Scene(HandScene):
         """
         from jaxgrasp.viewer.scene import draw_scenes
 
-        best = np.flatnonzero(np.isfinite(ranking.effort))[:_PICTURES]
-        rows = ranking.order[best]
-        qpos = ranking.candidates.columns["qpos"][rows]
-        points, forces = hand.grasps(qpos).in_world_frame(ranking.forces[best])
+        columns = ranking.candidates.columns
+        best = np.flatnonzero(np.isfinite(ranking.effort))
+        # A picture shows one scene: that of the best grasp.
+        scenes = columns["scene"][ranking.order[best]] if "scene" in columns else np.zeros(len(best), int)
+        best = best[scenes == scenes[0]][:_PICTURES]
+        hand, rows = hands[int(scenes[0])], ranking.order[best]
+        qpos = columns["qpos"][rows]
+        grasps = hand.grasps(qpos, self.engine)
+        kept = ranking.forces.shape[1]
+        forces = np.zeros((len(best), *grasps.contacts.positions.shape[1:]))
+        forces[:, :kept] = ranking.forces[best][:, : forces.shape[1]]
+        points, forces = (np.asarray(x) for x in grasps.in_world_frame(forces))
         titles = [f"#{b + 1}: margin {ranking.margin[row]:.3g} {unit}" for b, row in zip(best, rows, strict=True)]
         try:
-            draw_scenes(path, hand.model, qpos, np.asarray(points), np.asarray(forces), titles)
+            draw_scenes(path, hand.model, qpos, points, forces, titles)
         except RuntimeError as error:
             raise OSError(str(error)) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(GivenScene):
+    """A hand and an object, whose candidates are configurations of files, or sampled."""
+
+    qpos: Path | None = None
+    """With --scene: configurations, .npy (N, nq), or .npz with the field qpos; other columns travel along. None samples
+    them around the scene's own: the object turned and moved, the fingers closed until they touch."""
+
+    samples: int = SAMPLED
+    """How many configurations to sample."""
+
+    seed: int = 0
+    """Of the samples."""
+
+    def check(self) -> None:
+        """Finds what cannot be used before any long work.
+
+        Raises:
+            CommandError: An option cannot be used.
+        """
+        super().check()
+        check_options(("--samples", self.samples, self.samples >= 1, "at least 1"))
+
+    def _sampled(self, hand: "HandObject") -> np.ndarray:
+        from jaxgrasp.cli.report import counting_bar
+        from jaxgrasp.hands import sample_configurations
+
+        with counting_bar("closing fingers", self.samples) as progress:
+            return sample_configurations(hand, self.samples, self.seed, progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedScene(GivenScene):
+    """A hand and an object, of whose configurations none is left out."""
+
+    min_contacts: int = 0
+    """Leave out configurations with fewer contacts."""
+
+    max_penetration: float = math.inf
+    """Leave out configurations in which hand and object are deeper in each other, m."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli import signals
+from jaxgrasp.cli.hand_scene import HandScene
 from jaxgrasp.cli.problems import CommandError, check_options, write_files
-from jaxgrasp.cli.scene import HandScene
 from jaxgrasp.cli.streams import one_line, printing
 from jaxgrasp.storage import atomic_write
 
@@ -28,6 +28,9 @@ class SceneSynthesis(HandScene):
 
     links: tuple[str, ...] = ()
     """Bodies of the hand that shall touch the object; none for the outermost one of every finger."""
+
+    contact_distance: float = 1e-3
+    """Geoms no farther apart than this touch, m: fingers are closed until they do, so that no file's gaps count."""
 
     min_contacts: int = 3
     """With fewer contacts a grasp is not good."""
@@ -91,7 +94,7 @@ class SceneSynthesis(HandScene):
         from jaxgrasp.cli.report import hand_bar, print_hand_synthesis
         from jaxgrasp.synthesis import synthesize_hand_grasps
 
-        hand = self.hand(friction, max_force)
+        hand = self.hand_object(friction, max_force)
         try:
             with hand_bar(starts, steps) as progress:
                 found = synthesize_hand_grasps(

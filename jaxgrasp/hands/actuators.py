@@ -1,6 +1,8 @@
 """What MuJoCo's actuators can do: transmission, limits of effort, stiffness, and commands for wanted efforts."""
 
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,28 +30,33 @@ class Actuators:
     """(actuators, 2), range of forces, torque limits of single joints included."""
     transmission: np.ndarray | None
     """B (hand's degrees of freedom, actuators); None where it varies with the configuration."""
+    reference: np.ndarray
+    """B in the reference configuration, with 1 where an arm happens to be zero there."""
 
-    def limits(self, length: jax.Array) -> tuple[jax.Array, jax.Array]:
+    @property
+    def capacity(self) -> np.ndarray:
+        """Half of the range of each effort, which may be infinite."""
+        with np.errstate(invalid="ignore"):
+            command = np.where(self.gain == 0, np.inf, np.abs(self.gain) * np.ptp(self.command, axis=-1) / 2)
+            return np.minimum(command, np.ptp(self.force, axis=-1) / 2)
+
+    def limits(self, length: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
         """Least and largest force at rest, (*batch, actuators), at lengths (*batch, actuators)."""
-        ends = [self.force_of(jnp.asarray(end, length.dtype), length) for end in self.command.T]
-        low, high = jnp.minimum(*ends), jnp.maximum(*ends)
-        least, most = (jnp.asarray(end, length.dtype) for end in self.force.T)
-        return jnp.clip(low, least, most), jnp.clip(high, least, most)
-
-    def force_of(self, command: jax.Array, length: jax.Array) -> jax.Array:
-        """Force at rest before it is limited, for commands and lengths (*batch, actuators)."""
-        gain, bias, slope = self._constants(length)
-        product = jnp.where(gain == 0, 0, gain * command)
-        return product + bias + slope * length
+        # An actuator without gain has no command, however far that may go.
+        reach = np.where(self.gain == 0, 0, self.gain * np.where(self.gain == 0, 0, self.command.T))
+        ends = [end.astype(length.dtype) + self._at_rest(length) for end in reach]
+        low, high = xp.minimum(*ends), xp.maximum(*ends)
+        least, most = (end.astype(length.dtype) for end in self.force.T)
+        return xp.clip(low, least, most), xp.clip(high, least, most)
 
     def command_for(self, force: jax.Array, length: jax.Array) -> jax.Array:
         """The command that gives a force at rest; NaN for an actuator that no command moves."""
-        gain, bias, slope = self._constants(length)
-        return jnp.where(gain == 0, jnp.nan, (force - bias - slope * length) / jnp.where(gain == 0, 1, gain))
+        gain = jnp.asarray(self.gain, length.dtype)
+        return jnp.where(gain == 0, jnp.nan, (force - self._at_rest(length)) / jnp.where(gain == 0, 1, gain))
 
-    def _constants(self, like: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        gain, bias, slope = (jnp.asarray(x, like.dtype) for x in (self.gain, self.bias, self.slope))
-        return gain, bias, slope
+    def _at_rest(self, length: Any) -> Any:
+        """The force without a command."""
+        return self.bias.astype(length.dtype) + self.slope.astype(length.dtype) * length
 
 
 def read_actuators(model: mujoco.MjModel, dofs: np.ndarray) -> Actuators:
@@ -64,10 +71,10 @@ def read_actuators(model: mujoco.MjModel, dofs: np.ndarray) -> Actuators:
             else than joints and tendons, or with a limit that this cannot express.
     """
     moment = _moments(model)
-    acts = np.array([_acts_on(model, a, moment[a]) for a in range(model.nu)]).reshape(model.nu, model.nv)
+    acts = np.array([_acts_on(model, a, moment[a]) for a in range(model.nu)], bool).reshape(model.nu, model.nv)
     numbers = np.flatnonzero(acts[:, dofs].any(-1))
     on_tendon = model.actuator_trntype[numbers] == int(mujoco.mjtTrn.mjTRN_TENDON)
-    constant = all(_is_fixed(model, t) for t in model.actuator_trnid[numbers[on_tendon], 0])
+    constant = all(is_fixed(model, t) for t in model.actuator_trnid[numbers[on_tendon], 0])
     affine = np.array([_affine(model, a) for a in numbers]).reshape(-1, 3)
     unlimited = np.array([-np.inf, np.inf])
     limited = lambda flags, ranges: np.where(flags[numbers, None], ranges[numbers], unlimited)  # noqa: E731
@@ -84,6 +91,7 @@ def read_actuators(model: mujoco.MjModel, dofs: np.ndarray) -> Actuators:
         command=command,
         force=_tendon_limits(model, numbers, _joint_limits(model, dofs, numbers, moment, acts, force)),
         transmission=moment[np.ix_(numbers, dofs)].T if constant else None,
+        reference=np.where(acts & (moment == 0), 1.0, moment)[np.ix_(numbers, dofs)].T,
     )
 
 
@@ -122,20 +130,25 @@ def _acts_on(model: mujoco.MjModel, a: int, moment: np.ndarray) -> np.ndarray:
     if kind != mujoco.mjtTrn.mjTRN_TENDON:
         raise ValueError(f"scene: actuator {_name(model, a)} acts by {kind.name[6:].lower()}; wanted joint or tendon")
     tendon = model.actuator_trnid[a, 0]
-    if _is_fixed(model, tendon):
+    if is_fixed(model, tendon):
         return moment != 0
     # A tendon that happens to cross a joint's axis has no moment there; elsewhere it has.
+    return moved_by_tendon(model, tendon)
+
+
+def moved_by_tendon(model: mujoco.MjModel, tendon: int) -> np.ndarray:
+    """The degrees of freedom (nv,) that a tendon over sites and geoms acts on in some configuration."""
     path = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
     bodies = {
         int((model.site_bodyid if kind == int(mujoco.mjtWrap.mjWRAP_SITE) else model.geom_bodyid)[number])
         for kind, number in zip(model.wrap_type[path], model.wrap_objid[path], strict=True)
         if kind != int(mujoco.mjtWrap.mjWRAP_PULLEY)
     }
-    moved = np.array([_moved_by(model, body) for body in bodies])
+    moved = np.array([moved_by(model, body) for body in bodies])
     return moved.any(0) & ~moved.all(0)
 
 
-def _moved_by(model: mujoco.MjModel, body: int) -> np.ndarray:
+def moved_by(model: mujoco.MjModel, body: int) -> np.ndarray:
     """The degrees of freedom (nv,) that move a body."""
     moved = np.zeros(model.nv, bool)
     while body:
@@ -144,7 +157,8 @@ def _moved_by(model: mujoco.MjModel, body: int) -> np.ndarray:
     return moved
 
 
-def _is_fixed(model: mujoco.MjModel, tendon: int) -> bool:
+def is_fixed(model: mujoco.MjModel, tendon: int) -> bool:
+    """Whether a tendon is a sum of joint positions."""
     first = model.tendon_adr[tendon]
     return bool(np.all(model.wrap_type[first : first + model.tendon_num[tendon]] == int(mujoco.mjtWrap.mjWRAP_JOINT)))
 

@@ -1,8 +1,9 @@
 """Joints that an equality constraint makes follow others: the velocities that remain free."""
 
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -25,26 +26,33 @@ class Couplings:
     free: np.ndarray
 
     @property
+    def constant(self) -> np.ndarray:
+        """T (dofs, free), where all slopes are constant."""
+        return self.velocities(np.zeros(len(self.free) + len(self.follower)), np)
+
+    @property
     def linear(self) -> bool:
         """Whether all slopes are constant."""
         return not self.coefficients[:, 1:].any()
 
-    def velocities(self, joints: jax.Array) -> jax.Array:
+    def velocities(self, joints: Any, xp: ModuleType = jnp) -> Any:
         """T (*batch, dofs, free): all joint velocities from the free ones, at joint positions (*batch, dofs)."""
         count = joints.shape[-1]
-        rows = list(jnp.moveaxis(jnp.broadcast_to(jnp.eye(count, dtype=joints.dtype), (*joints.shape, count)), -2, 0))
+        if not count:
+            return joints[..., None]
+        rows = list(xp.moveaxis(xp.broadcast_to(xp.eye(count, dtype=joints.dtype), (*joints.shape, count)), -2, 0))
         # Couplings may hang on each other in any order.
         for _ in range(len(self.follower)):
             for follower, leader, coefficients, reference in zip(
                 self.follower, self.leader, self.coefficients, self.reference, strict=True
             ):
                 if leader < 0:
-                    rows[follower] = jnp.zeros_like(rows[follower])
+                    rows[follower] = xp.zeros_like(rows[follower])
                     continue
                 at = joints[..., leader] - float(reference)
                 slope = sum(float(c) * at**power for power, c in enumerate(coefficients))
                 rows[follower] = slope[..., None] * rows[leader]
-        return jnp.stack(rows, -2)[..., self.free]
+        return xp.stack(rows, -2)[..., self.free]
 
 
 def read_couplings(model: mujoco.MjModel, dofs: np.ndarray) -> Couplings:
@@ -69,6 +77,11 @@ def read_couplings(model: mujoco.MjModel, dofs: np.ndarray) -> Couplings:
             slopes = model.eq_data[e, 1:5] * np.arange(1, 5)
             if leader < 0:
                 found.append((at, -1, np.zeros(4), 0.0))
+            elif int(model.jnt_dofadr[leader]) not in place:
+                raise ValueError(
+                    f"scene: joint {model.joint(follower).name!r} of the hand follows {model.joint(leader).name!r}, "
+                    "which is not one of the hand's hinges and slides"
+                )
             else:
                 reference = model.qpos0[model.jnt_qposadr[leader]]
                 found.append((at, place[int(model.jnt_dofadr[leader])], slopes, reference))

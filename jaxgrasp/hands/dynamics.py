@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxgrasp.arrays import as_float
 from jaxgrasp.hands.hand_object import HandObject
 from jaxgrasp.hands.kinematics import HINGE, matrices, place
+from jaxgrasp.hands.mechanics import point_velocities
 
 
 def joint_dynamics(
@@ -40,7 +41,8 @@ def joint_dynamics(
         model.body_ipos[bodies].T,
         matrices(model.body_iquat[bodies]),
     )
-    linear = hand.point_velocities(poses, centres.T, moved)
+    axes, anchors = poses.axes[:, hand.joints].T, poses.anchors[:, hand.joints].T
+    linear = point_velocities(axes, anchors, model.jnt_type[hand.joints] == HINGE, centres.T, moved, jnp)
     turns = jnp.asarray(moved & (model.jnt_type[hand.joints] == HINGE))
     axes = jnp.where(turns[..., None], poses.axes[:, hand.joints].T[:, None], 0)
     angular = jnp.einsum("jibn,nbvj->nbvi", frames, axes)

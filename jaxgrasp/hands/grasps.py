@@ -12,19 +12,29 @@ class HandGrasps:
     """Grasps of a `HandObject` in a batch of configurations."""
 
     contacts: Contacts
-    """In the object's frame about its centre of mass, the nearest first; active where they touch."""
+    """In the object's frame about its centre of mass, those of the nearest links first; active where they touch."""
     distances: Float[Array, "*batch contacts"]
     """Of the surfaces at each contact, m, negative where they penetrate; inf in slots without a point."""
     links: Int[Array, "*batch contacts"]
     """The body of the hand that each contact is on, its number in the model."""
     touching: Int[Array, "*batch"]
-    """How many contacts touch, also those beyond `max_contacts`."""
+    """How many links touch (how many points, where all points are contacts), also those beyond `max_contacts`."""
+    left_out: Int[Array, "*batch"]
+    """How many of these `max_contacts` leaves out."""
     penetration: Float[Array, "*batch"]
     """The deepest penetration of hand and object, m, at least 0."""
     required_wrench: Float[Array, "*batch 6"]
-    """The object's weight, to be borne, N and N m, object frame; NaN where the configuration is not admissible."""
-    actuation: Actuation
-    """What the actuators can do; joints are the hand's, without those that a coupling makes follow others."""
+    """The object's weight less its gravity compensation, to be borne, N and N m, object frame; NaN where the
+    configuration is not admissible."""
+    actuation: Actuation | None
+    """What the hand can do; joints are its own, without those that a coupling makes follow others. Efforts are those of
+    the actuators, then those that joints bear by themselves: dry friction, stops, springs on which nothing else acts.
+    The springs' torques are part of all of them; `HandObject.actuator_efforts` takes these out. None where nothing acts
+    on the hand."""
+    spring_torques: Float[Array, "*batch joints"]
+    """c, N m or N."""
+    spring_efforts: Float[Array, "*batch efforts"]
+    """What these are in the efforts of `actuation`, by which its limits are moved."""
     actuator_lengths: Float[Array, "*batch actuators"]
     """rad or m, from which position servos pull."""
     joint_stiffness: Float[Array, "*batch joints joints"]

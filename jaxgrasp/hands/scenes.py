@@ -64,7 +64,7 @@ def four_fingers(object: str | Path = "sphere", size: float | None = None) -> mu
     Raises:
         ValueError: The object is unknown, or the size is not positive.
     """
-    spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("four_fingers.xml")))
+    spec = mujoco.MjSpec.from_file(str(_four_fingers_file()))
     return _finish(spec, object, size, position=(0.0, 0.0, 0.085))
 
 
@@ -78,6 +78,14 @@ def _shadow_hand_file() -> Path:
             return path
     where = f"{paths[0]} is missing" if paths else "mujoco-mjx is not installed"
     raise FileNotFoundError(f"the Shadow Hand comes with the package mujoco-mjx, but {where}: pip install mujoco-mjx")
+
+
+def _four_fingers_file() -> Path:
+    return Path(__file__).with_name("four_fingers.xml")
+
+
+HAND_FILES = {"shadow_hand": _shadow_hand_file, "four_fingers": _four_fingers_file}
+"""Where the files of the built-in hands are, by name."""
 
 
 def _couple(spec: mujoco.MjSpec, finger: str) -> None:

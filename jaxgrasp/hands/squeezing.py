@@ -22,7 +22,7 @@ def opened(hand: HandObject, qpos: ArrayLike, clearance: float = 0.01) -> Float[
 
 
 def squeezed(hand: HandObject, qpos: ArrayLike, grasps: HandGrasps, efforts: ArrayLike) -> Float[Array, "*batch nq"]:
-    """The squeeze: where joints would go under the efforts if nothing were in the way, q + K^+ B u.
+    """The squeeze: where joints would go under the actuators' efforts if nothing were in the way, q + K^+ (B u + c).
 
     Joints without stiffness, those of motors for example, stay.
 
@@ -35,8 +35,12 @@ def squeezed(hand: HandObject, qpos: ArrayLike, grasps: HandGrasps, efforts: Arr
     Returns:
         (*batch, nq), not limited to the joints' ranges: a finger at the end of its range presses by being sent beyond.
     """
-    qpos, efforts = as_float("qpos", qpos, (hand.nq,)), as_float("efforts", efforts, ("n_u",))
-    torques = jnp.einsum("...vu,...u->...v", grasps.actuation.transmission, efforts)
+    qpos = as_float("qpos", qpos, (hand.nq,))
+    if grasps.actuation is None:
+        return qpos
+    own = hand.actuator_efforts(grasps, efforts)
+    transmission = grasps.actuation.transmission[..., : own.shape[-1]]
+    torques = jnp.einsum("...vu,...u->...v", transmission, own) + grasps.spring_torques
     free = jnp.einsum("...vw,...w->...v", jnp.linalg.pinv(grasps.joint_stiffness, rtol=1e-9), torques)
     places = hand.model.jnt_qposadr[hand.joints]
     following = hand.couplings.velocities(qpos[..., places])

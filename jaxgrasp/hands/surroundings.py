@@ -168,11 +168,11 @@ class Surroundings:
             poses=poses,
         )
 
-    def actuation(self, qpos: Float[Array, "n nq"], near: Near, contacts: Contacts) -> Actuation:
+    def actuation(self, qpos: Float[Array, "n nq"], near: Near, contacts: Contacts) -> Actuation | None:
         """What the actuators can do at the points of `near`, whose contacts these are."""
         links = jnp.broadcast_to(jnp.asarray(self.links), near.distance.shape)
         frames, rotation = contacts.frames, near.object_rotation
-        return self.hand.transmission(qpos, near.poses, near.position, rotation, frames, links)[1]
+        return self.hand.actuation_at(qpos, near.poses, near.position, rotation, frames, links)
 
     def surface_points(self, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
         """The points of the object's surface nearest to given ones, m, and its outward normals there.

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jaxgrasp.arrays import safe_divide, safe_norm
 from jaxgrasp.geometry.pairs import Geom, Hull, slots, touch
+from jaxgrasp.hands.contact_parameters import hand_object_pairs
 
 KIND = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
@@ -57,6 +57,8 @@ class PairTable:
     """(slots,), body of the hand."""
     friction: np.ndarray
     """(slots,), sliding friction by MuJoCo's rule."""
+    margin: np.ndarray
+    """(slots,), up to which distance MuJoCo's contacts push, m."""
 
 
 def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> PairTable:
@@ -71,17 +73,12 @@ def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> P
         ValueError: A pair of geoms that can touch has no function, or nothing of the hand can touch the object.
     """
     found: dict[tuple, list[tuple[int, int]]] = {}
-    friction: dict[tuple[int, int], float] = _pairs(model, hand, object)
-    for pair in friction:
+    known = hand_object_pairs(model, hand, object)
+    for pair in known:
         kinds = _kinds(model, *pair)
         meshes = tuple(int(model.geom_dataid[g]) if k == "mesh" else -1 for g, k in zip(pair, kinds, strict=True))
         found.setdefault((kinds, meshes), []).append(pair)
-    if not found:
-        raise ValueError(
-            "scene: no geom of the hand can touch a geom of the object; "
-            "wanted contype and conaffinity that let some of them collide"
-        )
-    groups, link, mu = [], [], []
+    groups, link, mu, margin = [], [], [], []
     used = np.unique([pair for pairs in found.values() for pair in pairs])
     for (kinds, meshes), pairs in found.items():
         geoms = np.array(pairs)
@@ -89,8 +86,10 @@ def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> P
         groups.append(Group(kinds, *np.searchsorted(used, geoms).T, hulls))
         count = slots(*kinds)
         link.append(np.tile(model.geom_bodyid[geoms[:, 0]], count))
-        mu.append(np.tile([friction[pair] for pair in pairs], count))
-    return PairTable(tuple(groups), used, model.geom_size[used], np.concatenate(link), np.concatenate(mu))
+        mu.append(np.tile([known[pair].friction for pair in pairs], count))
+        margin.append(np.tile([known[pair].margin for pair in pairs], count))
+    slots_of = [np.concatenate(parts) for parts in (link, mu, margin)]
+    return PairTable(tuple(groups), used, model.geom_size[used], *slots_of)
 
 
 def touching_points(table: PairTable, positions: jax.Array, rotations: jax.Array) -> Points:
@@ -120,27 +119,6 @@ def touching_points(table: PairTable, positions: jax.Array, rotations: jax.Array
     return Points(position, -normal, distance)
 
 
-def merged_point(points: Points, merge: float, contact_distance: float) -> Points:
-    """One point (n, ...) for those of a link (n, slots, ...): the mean of the touching ones near the nearest.
-
-    Args:
-        points: Batch first.
-        merge: How near to the nearest one, m.
-        contact_distance: How near the object, m.
-    """
-    nearest = points.distance.argmin(-1)[:, None]
-    best = [jnp.take_along_axis(x, nearest.reshape(-1, *[1] * (x.ndim - 1)), 1) for x in points]
-    near = safe_norm(points.position - best[0]) <= merge
-    share = (near & (points.distance <= contact_distance)).astype(points.position.dtype)
-    # Where nothing touches, the nearest point stands for itself.
-    own = jnp.arange(share.shape[-1]) == nearest
-    share = jnp.where(share.any(-1, keepdims=True), share, own.astype(share.dtype))
-    # Slots that hold no point may hold anything.
-    mean = lambda x: jnp.sum(jnp.where(share[..., None] > 0, x, 0), 1) / share.sum(-1, keepdims=True)  # noqa: E731
-    normal = mean(points.normal)
-    return Points(mean(points.position), safe_divide(normal, safe_norm(normal)[..., None]), best[2][:, 0])
-
-
 def _geoms(table: PairTable, positions: jax.Array, rotations: jax.Array, geoms: np.ndarray, hull: Hull | None) -> Geom:
     lanes = positions.shape[2:]
     size = jnp.asarray(table.sizes[geoms].T, positions.dtype).reshape(3, len(geoms), *[1] * len(lanes))
@@ -160,7 +138,7 @@ def _kinds(model: mujoco.MjModel, hand: int, object: int) -> tuple[str, str]:
         names = [f"{_name(model, g)} ({mujoco.mjtGeom(model.geom_type[g]).name[7:].lower()})" for g in (hand, object)]
         raise ValueError(
             f"scene: geoms {names[0]} and {names[1]} can touch, but no distance is known between their kinds; "
-            f"wanted {', '.join(KIND.values())}, or contype and conaffinity that keep them apart"
+            f"wanted {', '.join(KIND.values())}, contype and conaffinity that keep them apart, or engine 'mujoco'"
         ) from None
     return kinds
 
@@ -183,32 +161,3 @@ def hull_of(model: mujoco.MjModel, mesh: int) -> Hull:
     faces = graph[edges : edges + 3 * num_faces].reshape(-1, 3)
     number = {int(v): i for i, v in enumerate(kept)}
     return Hull.from_faces(vertices[kept], np.vectorize(number.__getitem__)(faces))
-
-
-def _pairs(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> dict[tuple[int, int], float]:
-    """Pairs (geom of the hand, geom of the object) that MuJoCo's filters let pass, and their sliding friction."""
-    of_hand = np.flatnonzero(np.isin(model.geom_bodyid, hand))
-    of_object = np.flatnonzero(np.isin(model.geom_bodyid, object))
-    friction = {}
-    excluded = {tuple(sorted((s >> 16, s & 0xFFFF))) for s in model.exclude_signature.tolist()}
-    for g in of_hand.tolist():
-        for o in of_object.tolist():
-            bodies = tuple(sorted((int(model.geom_bodyid[g]), int(model.geom_bodyid[o]))))
-            meet = model.geom_contype[g] & model.geom_conaffinity[o] | model.geom_contype[o] & model.geom_conaffinity[g]
-            # What is fixed to the same body, the world for example, does not collide.
-            moving = model.body_weldid[bodies[0]] != model.body_weldid[bodies[1]]
-            if meet and moving and bodies not in excluded:
-                friction[g, o] = _combined_friction(model, g, o)
-    # Pairs that are spelt out count whatever the masks say.
-    for one, other, values in zip(model.pair_geom1, model.pair_geom2, model.pair_friction, strict=True):
-        for pair in ((int(one), int(other)), (int(other), int(one))):
-            if pair[0] in of_hand and pair[1] in of_object:
-                friction[pair] = float(values[0])
-    return friction
-
-
-def _combined_friction(model: mujoco.MjModel, a: int, b: int) -> float:
-    """That of the geom with the higher priority, the larger one where these are equal."""
-    if model.geom_priority[a] != model.geom_priority[b]:
-        return float(model.geom_friction[a if model.geom_priority[a] > model.geom_priority[b] else b, 0])
-    return float(max(model.geom_friction[a, 0], model.geom_friction[b, 0]))

@@ -1,12 +1,12 @@
 """From configurations of a hand to candidates that can be ranked."""
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxgrasp.candidates import Candidates
 from jaxgrasp.contact import Actuation
@@ -25,6 +25,8 @@ def candidates_of(
     source: str,
     limited: bool = True,
     columns: dict[str, np.ndarray] | None = None,
+    engine: str | None = None,
+    index: Int[np.ndarray, " batch"] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Candidates:
     """Finds the contacts of a hand in many configurations, and what its actuators can do.
@@ -35,10 +37,13 @@ def candidates_of(
         source: Where they are from.
         limited: Whether the actuators' limits count; else every contact may push with its largest force.
         columns: What else travels along, arrays with a leading axis of N, by name.
+        engine: What finds the contacts, see `HandObject.grasps`.
+        index: Rows of the configurations in their source; None counts them.
         progress: Called after each tile with the number of configurations done.
 
     Returns:
-        The candidates, with the columns `qpos`, `touching` (how many contacts touch) and `penetration`, m.
+        The candidates, with the columns `qpos`, `touching` (how many links touch), `left_out` (how many of these have
+        no contact) and `penetration`, m.
 
     Raises:
         ValueError: A configuration has another length.
@@ -51,7 +56,7 @@ def candidates_of(
         rows = np.arange(first, first + min(TILE, count)) % count
         # What is the same for all is kept once.
         stop = {name: 1 for name in _TRANSMISSION} if hand.constant_transmission else {}
-        found = _columns(hand, qpos[rows], limited)
+        found = _columns(hand, qpos[rows], limited, engine)
         parts.append({name: np.asarray(x)[: stop.get(name, count - first)] for name, x in found.items()})
         if progress is not None:
             progress(min(first + TILE, count))
@@ -61,7 +66,7 @@ def candidates_of(
             name: np.broadcast_to(x[:1], (count, *x.shape[1:])) for name, x in found.items() if name in _TRANSMISSION
         }
     contacts = {name: found.pop(name) for name in _CONTACTS}
-    own = {"touching": found.pop("touching"), "penetration": found.pop("penetration"), "qpos": qpos}
+    own = {name: found.pop(name) for name in ("touching", "left_out", "penetration")} | {"qpos": qpos}
     return Candidates(
         **contacts,
         mass=np.full(count, hand.object_mass),
@@ -69,7 +74,7 @@ def candidates_of(
         columns=own | (columns or {}),
         sources=(source,),
         source=np.zeros(count, int),
-        index=np.arange(count),
+        index=np.arange(count) if index is None else index,
     )
 
 
@@ -86,12 +91,23 @@ def kept(candidates: Candidates, min_contacts: int, max_penetration: float) -> B
     return fine | ~known
 
 
-def _columns(hand: HandObject, qpos: np.ndarray, limited: bool) -> dict[str, jax.Array]:
-    grasps = hand.grasps(qpos)
+def trimmed(candidates: Candidates) -> Candidates:
+    """The candidates without contact slots that none of them uses, in steps of four, so that few programs serve all."""
+    most = int(candidates.active.sum(-1).max(initial=1))
+    count = min(candidates.num_contacts, -(-most // 4) * 4)
+    # Contacts of hands come in order, those that touch first.
+    own = {name: getattr(candidates, name)[:, :count] for name in _CONTACTS}
+    if "jacobian" in candidates.hand:
+        own["hand"] = candidates.hand | {"jacobian": candidates.hand["jacobian"][:, :count]}
+    return replace(candidates, **own)
+
+
+def _columns(hand: HandObject, qpos: np.ndarray, limited: bool, engine: str | None) -> dict[str, jax.Array]:
+    grasps = hand.grasps(qpos, engine)
     columns = {name: getattr(grasps.contacts, name) for name in _CONTACTS}
-    columns |= {name: getattr(grasps, name) for name in ("touching", "penetration", "required_wrench")}
-    if limited:
+    columns |= {name: getattr(grasps, name) for name in ("touching", "left_out", "penetration", "required_wrench")}
+    if limited and grasps.actuation is not None:
         actuation = {f.name: getattr(grasps.actuation, f.name) for f in fields(Actuation)}
-        idle, one = (hand.controls(grasps, jnp.full_like(grasps.actuator_lengths, effort)) for effort in (0, 1))
+        idle, one = (hand.controls(grasps, jnp.full_like(grasps.spring_efforts, effort)) for effort in (0, 1))
         columns |= actuation | {"idle_controls": idle, "controls_per_effort": one - idle}
     return {name: column for name, column in columns.items() if column is not None}

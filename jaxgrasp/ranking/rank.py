@@ -200,7 +200,10 @@ class _Scores:
     def ranking(
         self, candidates: Candidates, order: np.ndarray, share: float, answers: list[tuple[np.ndarray, ...]]
     ) -> Ranking:
-        empty, actuators = np.empty((0, candidates.num_contacts, 3)), candidates.hand.get("lower", np.empty((0, 0)))
+        empty, actuators = (
+            np.empty((0, candidates.num_contacts, 3)),
+            candidates.hand.get("idle_controls", np.empty((0, 0))),
+        )
         answers = [(empty, empty, np.empty(0), np.empty(0, dtype=int), actuators[:0]), *answers]
         forces, object_forces, effort, tightening_status, controls = map(np.concatenate, zip(*answers, strict=True))
         return Ranking(

@@ -1,0 +1,335 @@
+"""What joints bear by themselves, contact parameters and bodies that are no hand, each against C MuJoCo's statics."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+import jaxgrasp as jg
+from jaxgrasp.hands import HandObject
+
+PUSHES = jg.DisturbanceSet.forces(1.0)
+OPTION = '<option cone="elliptic" impratio="100" timestep="0.001" gravity="0 0 {gravity}"/>'
+
+STIFF = 'solref="0.002 1" solimp="0.99 0.99 0.001"'
+
+
+def four_pads(joint="", tendon="", rest="", pad="", cube="", gravity=-9.81, actuators=4, slide=True, more="") -> str:
+    """Four pads on slides, 2 cm in, that touch the sides of a cube of 6 cm and 0.1 kg."""
+    pads = motors = tendons = ""
+    for k, (x, y) in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1)]):
+        joints = f'<joint name="j{k}" type="slide" axis="{-x} {-y} 0" damping="5" {joint}/>' if slide else ""
+        at = 0.065 if slide else 0.045
+        pads += (
+            f'<body name="f{k}" pos="{at * x} {at * y} 0" gravcomp="1">{joints}'
+            f'<geom name="g{k}" type="sphere" size="0.015" mass="0.05" {STIFF} {pad}/></body>'
+        )
+        motors += f'<motor name="m{k}" joint="j{k}" ctrlrange="-5 5"/>' if k < actuators and slide else ""
+        tendons += f'<fixed name="t{k}" {tendon}><joint joint="j{k}" coef="1"/></fixed>' if tendon else ""
+    return (
+        f'<mujoco>{OPTION.format(gravity=gravity)}<worldbody>{more}{pads}<body name="object"><freejoint/>'
+        f'<geom name="cube" type="box" size="0.03 0.03 0.03" mass="0.1" {STIFF} {cube}/></body></worldbody>'
+        f"<tendon>{tendons}</tendon><actuator>{motors}</actuator>{rest}</mujoco>"
+    )
+
+
+def closed(model: mujoco.MjModel) -> np.ndarray:
+    qpos = model.qpos0.copy()
+    qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE]] = 0.02
+    return qpos
+
+
+def ranked(xml: str, *, weight: bool = True, pushes=PUSHES, **options):
+    model = mujoco.MjModel.from_xml_string(xml)
+    hand = HandObject.from_mjcf(model, "object", **options)
+    grasps = hand.grasps(closed(model))
+    load = grasps.required_wrench if weight else None
+    found = jg.largest_disturbance(grasps.contacts, pushes, required_wrench=load, actuation=grasps.actuation)
+    return hand, grasps, found
+
+
+def pressed(xml: str, command: float) -> np.ndarray:
+    """C's normal forces after two seconds under a command, without gravity."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.opt.gravity[:] = 0
+    data, force, found = mujoco.MjData(model), np.zeros(6), np.zeros(4)
+    data.qpos, data.ctrl[:] = closed(model), command
+    mujoco.mj_step(model, data, 2000)
+    for k in range(data.ncon):
+        mujoco.mj_contactForce(model, data, k, force)
+        found[min(model.geom_bodyid[data.contact.geom[k]].tolist()) - 1] += force[0]
+    return found
+
+
+SPRINGS = {
+    "none": ("", ""),
+    "opening": ('stiffness="100" springref="0"', ""),
+    "too strong": ('stiffness="400" springref="0"', ""),
+    "closing": ('stiffness="100" springref="0.04"', ""),
+    "tendon": ("", 'stiffness="100" springlength="0 0.001"'),
+    "hardening": ('stiffness="0 5000"', ""),
+}
+
+
+@pytest.mark.parametrize("kind", SPRINGS)
+def test_springs_decide_how_hard_motors_press(kind):
+    joint, tendon = SPRINGS[kind]
+    xml = four_pads(joint, tendon)
+    hand, grasps, found = ranked(xml, weight=False)
+    data = mujoco.MjData(hand.model)
+    data.qpos = closed(hand.model)
+    mujoco.mj_forward(hand.model, data)
+    own = data.qfrc_spring[hand.dofs]
+    np.testing.assert_allclose(grasps.spring_torques, own, atol=1e-12)
+    # Pads push along their slides: of f_max = 10 N the motors' 5 N and the springs leave this.
+    most = np.asarray(grasps.actuation.upper)
+    np.testing.assert_allclose(most, 5 + own)
+    reached = pressed(xml, 5.0)
+    if kind == "too strong":
+        assert reached.max() == 0 and not found.margin > 0
+        return
+    # Contacts give by a fraction of a millimetre, in which a spring of 100 N/m changes by some hundredths of a newton.
+    np.testing.assert_allclose(reached, most, atol=0.2)
+    free = ranked(four_pads(), weight=False)[-1].margin
+    np.testing.assert_allclose(found.margin, free * most[0] / 5, rtol=1e-6)
+    effort = jg.least_effort(grasps.contacts, PUSHES, 0.5 * found.margin, actuation=grasps.actuation)
+    command = np.asarray(hand.controls(grasps, effort.actuator_efforts))
+    forces = -np.asarray(effort.forces)[np.argsort(np.asarray(grasps.links)), 2]
+    np.testing.assert_allclose(pressed(xml, command[0]), forces, atol=0.2)
+
+
+def test_engines_agree_on_springs():
+    for kind in ("closing", "tendon", "hardening"):
+        hand, grasps, _ = ranked(four_pads(*SPRINGS[kind]), weight=False)
+        other = hand.grasps(closed(hand.model), "distance")
+        np.testing.assert_allclose(other.spring_torques, grasps.spring_torques, atol=1e-12)
+        np.testing.assert_allclose(other.actuation.upper, grasps.actuation.upper, atol=1e-9)
+
+
+def held(xml: str) -> bool:
+    """Whether C keeps the cube within 5 mm for a second under its weight, without any command."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos = closed(model)
+    mujoco.mj_step(model, data, 1000)
+    return bool(np.linalg.norm(data.body("object").xpos) < 0.005)
+
+
+@pytest.mark.parametrize(
+    ("joint", "holds"),
+    [
+        ("", False),
+        ('stiffness="200" springref="0.03"', True),
+        ('stiffness="10" springref="0.03"', False),
+    ],
+)
+def test_only_springs_decide(joint, holds):
+    """Without actuators pads hold the cube, by friction 1, where 4 x 2 N of their springs are above its 0.98 N."""
+    # The cube is a little wider than it was, so that soft contacts press with what the springs give.
+    xml = four_pads(joint, actuators=0)
+    _, grasps, found = ranked(xml, unreached="free" if joint else "held")
+    if not joint:
+        # Nothing acts: whether joints that nothing drives bear anything is then what `unreached` says.
+        assert grasps.actuation is None and found.status == jg.Status.SOLVED
+    else:
+        assert (found.status == jg.Status.SOLVED) == holds
+    assert held(xml) == holds
+
+
+@pytest.mark.parametrize(("friction", "holds"), [("1", True), ("0.1", False)])
+def test_only_dry_friction_decides(friction, holds):
+    """One motor presses a cube against a pad that nothing but dry friction keeps from giving way."""
+    # Softer, MuJoCo's friction creeps.
+    xml = wedge(f'frictionloss="{friction}" solimpfriction="0.9999 0.9999 0.001"')
+    found = ranked(xml, weight=False, pushes=SIDEWAYS, unreached="free")[-1]
+    assert (found.status == jg.Status.SOLVED and found.margin > 0.1) == holds
+    assert stays(xml, 0.8) == holds
+
+
+@pytest.mark.parametrize(("limit", "holds"), [('range="-0.02 0.02" limited="true"', True), ("", False)])
+def test_only_a_stop_decides(limit, holds):
+    """The pad leans back on the end of its range, or gives way."""
+    xml = wedge(limit)
+    _, _, found = ranked(xml, weight=False, pushes=SIDEWAYS, unreached="free")
+    assert (found.status == jg.Status.SOLVED and found.margin > 0.1) == holds
+    assert stays(xml, 0.8) == holds
+
+
+SIDEWAYS = jg.DisturbanceSet.vertices(np.eye(6)[[2]])
+
+
+def wedge(joint: str) -> str:
+    """A motor's pad presses a cube along x against a passive one, whose slide is at the upper end of its range."""
+    return (
+        f'<mujoco><option cone="elliptic" impratio="100" timestep="0.001" gravity="0 0 0"/><worldbody>'
+        '<body name="a" pos="-0.065 0 0"><joint name="a" type="slide" axis="1 0 0" damping="5"/>'
+        '<geom type="sphere" size="0.015" mass="0.05"/></body>'
+        f'<body name="b" pos="0.025 0 0"><joint name="b" type="slide" axis="1 0 0" damping="5" {joint}/>'
+        '<geom type="sphere" size="0.015" mass="0.05"/></body>'
+        '<body name="object"><freejoint/><geom type="box" size="0.03 0.03 0.03" mass="0.1"/></body></worldbody>'
+        '<actuator><motor name="a" joint="a" ctrlrange="0.8 5"/></actuator></mujoco>'
+    )
+
+
+def stays(xml: str, command: float) -> bool:
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos, data.ctrl[:] = closed(model), command
+    mujoco.mj_step(model, data, 1000)
+    return bool(np.linalg.norm(data.body("object").xpos) < 0.005)
+
+
+def test_gravity_compensation_of_the_object_and_gravity_that_is_off():
+    weight = ranked(four_pads())[1].required_wrench
+    np.testing.assert_allclose(weight, [0, 0, 0.981, 0, 0, 0], atol=1e-12)
+    half = four_pads().replace('<body name="object">', '<body name="object" gravcomp="0.5">')
+    np.testing.assert_allclose(ranked(half)[1].required_wrench, 0.5 * weight, atol=1e-12)
+    off = four_pads().replace("<worldbody>", '<option><flag gravity="disable"/></option><worldbody>')
+    assert not np.any(ranked(off)[1].required_wrench)
+
+
+@pytest.mark.parametrize(
+    ("pad", "cube", "rest", "friction"),
+    [
+        ('condim="1"', 'condim="1"', "", 0.0),
+        ('condim="1" priority="1"', 'condim="3"', "", 0.0),
+        ('condim="1"', 'condim="3"', "", 1.0),
+        ('friction="0.3"', 'friction="0.7"', "", 0.7),
+        ('friction="0.3" priority="2"', 'friction="0.7"', "", 0.3),
+        ("", "", '<contact><pair geom1="g0" geom2="cube" condim="1"/></contact>', 0.0),
+        ("", "", '<contact><pair geom1="g0" geom2="cube" friction="0.2 0.2 0 0 0"/></contact>', 0.2),
+    ],
+)
+@pytest.mark.parametrize("engine", ["mujoco", "distance"])
+def test_friction_and_dimension_are_combined_as_in_mujoco(pad, cube, rest, friction, engine):
+    model = mujoco.MjModel.from_xml_string(four_pads(pad=pad, cube=cube, rest=rest))
+    hand, data = HandObject.from_mjcf(model, "object"), mujoco.MjData(model)
+    qpos = closed(model)
+    qpos[: len(hand.joints)] += 1e-4
+    grasps = hand.grasps(qpos) if engine == "mujoco" else hand.grasps(qpos, engine)
+    data.qpos = qpos
+    mujoco.mj_forward(model, data)
+    theirs = {}
+    for contact in data.contact:
+        link = min(model.geom_bodyid[contact.geom].tolist())
+        theirs[link] = contact.friction[0] if contact.dim > 1 else 0.0
+    ours = dict(zip(np.asarray(grasps.links).tolist(), np.asarray(grasps.contacts.friction).tolist(), strict=True))
+    assert ours == theirs and ours[1] == friction
+
+
+def test_margin_and_gap_say_how_far_contacts_push():
+    for margin, gap, touches in ((0.0, 0.0, False), (0.012, 0.0, True), (0.0, 0.012, False)):
+        xml = four_pads(pad=f'margin="{margin}" gap="{gap}"')
+        model = mujoco.MjModel.from_xml_string(xml)
+        hand = HandObject.from_mjcf(model, "object")
+        qpos = closed(model) - np.r_[np.full(4, 0.01), np.zeros(7)]
+        for engine in ("mujoco", "distance"):
+            assert (hand.grasps(qpos, engine).touching == 4) == touches
+
+
+def test_what_is_not_modelled_is_said():
+    for options in ({"pad": 'condim="4"'}, {"rest": PAIR}):
+        with pytest.warns(UserWarning, match=r"torsional|two tangential"):
+            ranked(four_pads(**options))
+
+
+PAIR = '<contact><pair geom1="g0" geom2="cube" friction="0.2 0.4 0 0 0"/></contact>'
+
+
+def test_many_points_of_one_finger_keep_no_other_finger_out():
+    """Two box pads a jaw: 16 points touch; a nanometre decides nothing."""
+    jaws = ""
+    for name, y in (("left", 1), ("right", -1)):
+        boxes = "".join(
+            f'<geom type="box" size="0.011 0.01 0.0093" pos="0 0 {z}" mass="0.02" friction="0.7"/>'
+            for z in (0.01, -0.01)
+        )
+        jaws += f'<body name="{name}" pos="0 {0.04 * y} 0">'
+        jaws += f'<joint name="{name}" type="slide" axis="0 {-y} 0"/>{boxes}</body>'
+    servos = "".join(
+        f'<position joint="{n}" kp="2000" ctrlrange="-0.02 0.02" forcerange="-20 20"/>' for n in ("left", "right")
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody>{jaws}<body name="object"><freejoint/><geom type="box" size="0.03 0.03 0.03" mass="0.2" '
+        f'friction="0.7"/></body></worldbody><actuator>{servos}</actuator></mujoco>'
+    )
+    offsets = np.array([0.0, 1e-9, 1e-6, 1e-5, 1e-4])
+    qpos = np.tile(model.qpos0, (len(offsets), 1))
+    qpos[:, 0], qpos[:, 1] = 1e-4 + offsets, 1e-4
+    for points, contacts in ((1, 2), (8, 16), (None, 16)):
+        hand = HandObject.from_mjcf(model, "object", points_per_link=points)
+        grasps = hand.grasps(qpos, "distance" if points is None else "mujoco")
+        weight, actuation = grasps.required_wrench, grasps.actuation
+        found = jg.largest_disturbance(grasps.contacts, PUSHES, required_wrench=weight, actuation=actuation)
+        assert (np.asarray(grasps.contacts.active).sum(-1) == contacts).all() and not grasps.left_out.any()
+        np.testing.assert_allclose(found.margin, found.margin[0], rtol=1e-3)
+        if points != 1:
+            # The margin with all 16 points, from an independent run of the same scene.
+            np.testing.assert_allclose(found.margin, 15.3165, atol=2e-3)
+    few = HandObject.from_mjcf(model, "object", max_contacts=1).grasps(qpos)
+    assert (few.left_out == 1).all() and (few.touching == 2).all()
+
+
+TABLE = '<body name="table" pos="0 0 -0.05"><geom type="box" size="0.3 0.3 0.02"/></body>'
+PALM = (
+    '<body name="palm" pos="0 0 0.3"><geom type="box" size="0.03 0.03 0.005" pos="0 0 0.1"/><body name="finger" '
+    'pos="0 0 -0.255"><joint name="j" type="slide" axis="0 0 -1"/><geom type="sphere" size="0.015"/></body></body>'
+)
+CUBE = '<body name="object"><freejoint/><geom type="box" size="0.03 0.03 0.03" mass="0.1"/></body>'
+FREE = '<body name="base"><freejoint/><geom size="0.01" pos="0 0 1"/><body name="wrist">{}</body></body>'
+CLUTTER = '<body name="mug" pos="0 0 0.2"><freejoint/><geom size="0.02"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("bodies", "hand"),
+    [
+        (TABLE + PALM, {"palm", "finger"}),
+        (CLUTTER + TABLE + PALM, {"palm", "finger"}),
+        (f'<body name="room">{TABLE}{PALM}</body>', {"room", "palm", "finger"}),
+        (TABLE + FREE.format(PALM), {"base", "wrist", "palm", "finger"}),
+        (
+            TABLE + PALM.replace("palm", "a").replace("finger", "b").replace('"j"', '"k"') + PALM,
+            {"a", "b", "palm", "finger"},
+        ),
+        (TABLE, {"table"}),
+    ],
+)
+def test_environment_is_no_finger(bodies, hand):
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}{CUBE}</worldbody></mujoco>")
+    found = HandObject.from_mjcf(model, "object")
+    assert {model.body(b).name for b in found.bodies} == hand
+    if "room" in hand:
+        named = HandObject.from_mjcf(model, "object", hand_body="palm")
+        assert {model.body(b).name for b in named.bodies} == {"palm", "finger"}
+        less = HandObject.from_mjcf(model, "object", hand_body="room", environment=["table"])
+        assert {model.body(b).name for b in less.bodies} == hand
+
+
+@pytest.mark.parametrize("slide", [True, False])
+def test_hands_without_actuators_have_no_torque_rows(slide):
+    _, grasps, found = ranked(four_pads(actuators=0, slide=slide))
+    assert grasps.actuation is None
+    assert found.status == jg.Status.SOLVED and found.margin > 1
+    assert ranked(four_pads(actuators=1))[1].actuation.transmission.shape[-1] == 1
+
+
+COUPLED = {
+    "linear": '<equality><joint joint1="j1" joint2="j0" polycoef="0 1 0 0 0"/></equality>',
+    "pinned": '<equality><joint joint1="j1" polycoef="0.02 0 0 0 0"/></equality>',
+    "chain": '<equality><joint joint1="j2" joint2="j1" polycoef="0 1 0 0 0"/>'
+    '<joint joint1="j1" joint2="j0" polycoef="0.01 0.5 0 0 0"/></equality>',
+}
+
+
+@pytest.mark.parametrize("kind", COUPLED)
+@pytest.mark.parametrize("engine", ["mujoco", "distance"])
+def test_linear_couplings(kind, engine):
+    """The same as with a vanishing quadratic term, which takes the way of couplings that vary."""
+    margins = []
+    for xml in (four_pads(rest=COUPLED[kind]), four_pads(rest=COUPLED[kind].replace(" 0 0 0", " 1e-12 0 0"))):
+        model = mujoco.MjModel.from_xml_string(xml)
+        grasps = HandObject.from_mjcf(model, "object").grasps(closed(model), engine)
+        found = jg.largest_disturbance(grasps.contacts, PUSHES, actuation=grasps.actuation)
+        margins.append(float(found.margin))
+    assert margins[0] == pytest.approx(margins[1], rel=1e-6) and margins[0] > 1
