@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, default=4_000_000, help="of all families together")
     parser.add_argument("--families", nargs="+", default=list(families.FAMILIES), choices=list(families.FAMILIES))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--batch", type=int, default=BATCH)
+    parser.add_argument("--batch", type=int, default=BATCH, help="lanes solved at once, at least")
     parser.add_argument("--workers", type=int, default=1, help="families at once")
     parser.add_argument("--record", type=Path, help="a file of lines of JSON, a batch each; goes on where it ends")
     options = parser.parse_args()
@@ -164,17 +164,19 @@ def main() -> None:
 def run(options: argparse.Namespace, done: set, family: str) -> list[dict]:
     """All batches of a family that are not done yet."""
     jax.config.update("jax_enable_x64", True)
-    batches = max(1, round(options.lanes / (options.batch * len(options.families))))
-    sample = -(-SAMPLE // (batches * len(options.families)))
+    together = len(options.families)
+    batches = max(1, options.lanes // (options.batch * together))
+    count = -(-options.lanes // (64 * batches * together)) * 64
+    sample = -(-SAMPLE // (batches * together))
     lines = []
     # Both programs are traced before the first audit, for one that fails has XLA run whatever is traced later.
     with mock.patch.dict(os.environ, JAXGRASP_AUDIT="off"):
-        first = families.make(family, options.batch, (options.seed, 0)).rounded(options.dtype)
+        first = families.make(family, count, (options.seed, 0)).rounded(options.dtype)
         lanes.least_effort(first, lanes.largest_disturbance(first).margin)
     for batch in range(batches):
-        if (options.dtype, family, options.seed, batch, options.batch) in done:
+        if (options.dtype, family, options.seed, batch, count) in done:
             continue
-        lines.append(examine(family, options.dtype, (options.seed, batch), options.batch, sample))
+        lines.append(examine(family, options.dtype, (options.seed, batch), count, sample))
         print(told(lines[-1]), flush=True)
         if options.record is not None:
             with options.record.open("a") as record:
