@@ -4,14 +4,14 @@ The package's names are those of `jaxgrasp.face`, which is imported when the fir
 to import, in which the command line could not answer Ctrl-C.
 """
 
-from typing import TYPE_CHECKING, Any
-
+# As in typing, whose import takes longer than all else until the command line can answer.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from jaxgrasp.face import *  # noqa: F403
     from jaxgrasp.face import __all__ as __all__
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     # Python itself looks for the face, and for names such as __path__.
     if name == "face" or (name.startswith("__") and name != "__all__"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
