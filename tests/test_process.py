@@ -132,7 +132,7 @@ def test_a_reader_who_has_gone_is_no_error():
     program = (
         "import time; from rich.console import Console; from jaxgrasp.cli.streams import printing\n"
         "time.sleep(0.5)\n"
-        "with printing(): Console().print('x' * 1_000_000)\n"
+        "with printing(): Console().print('a line' + chr(10) + 'another')\n"
         "raise SystemExit(7)"
     )
     line = f'{sys.executable} -c "$PROGRAM" | true; exit ${{PIPESTATUS[0]}}'
