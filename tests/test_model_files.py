@@ -68,6 +68,7 @@ def test_files_beside_and_below_are_found(tmp_path):
         (scene()[:-5], "not well-formed"),
         (scene(tail='<actuator><motor joint="j" gear="nan"/></actuator>'), "actuator_gear"),
         (scene(joint='type="wheel"'), "cannot compile"),
+        (scene(bodies='<replicate count="3000"><body><geom size=".01"/></body></replicate>'), "stack overflow"),
         ("", "not well-formed"),
     ],
 )

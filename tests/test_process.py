@@ -128,6 +128,18 @@ def test_standard_output_that_is_not_there(line, code, words):
     assert done.stderr == (f"jaxgrasp: {words}\n" if words else "")
 
 
+def test_a_reader_who_has_gone_is_no_error():
+    program = (
+        "import time; from rich.console import Console; from jaxgrasp.cli.streams import printing\n"
+        "time.sleep(0.5)\n"
+        "with printing(): Console().print('a line' + chr(10) + 'another')\n"
+        "raise SystemExit(7)"
+    )
+    line = f'{sys.executable} -c "$PROGRAM" | true; exit ${{PIPESTATUS[0]}}'
+    done = shell(line, PROGRAM=program)
+    assert (done.returncode, done.stderr) == (7, "")
+
+
 def test_any_encoding_will_do(grasps):
     name = "grö\udcffsse\n猫.npz"
     os.rename("grasps.npz", name)

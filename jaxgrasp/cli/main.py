@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
 
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.streams import one_line, prepared, printing
@@ -28,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 128 + number
 
 
-def program() -> NoReturn:
+def program() -> None:
     """Runs `main` as a process of its own."""
     with signals.handled():
         try:

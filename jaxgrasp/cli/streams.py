@@ -59,7 +59,8 @@ def printing() -> Iterator[None]:
         try:
             yield
         except SystemExit as exit:
-            leaving = exit
+            # So rich answers a reader who has gone.
+            leaving = None if isinstance(exit.__context__, BrokenPipeError) else exit
         sys.stdout.flush()
     except OSError as error:
         # What is still in the buffer would be tried again at the interpreter's end.

@@ -20,8 +20,11 @@ def _compile(path: str, result: str, memory: int, seconds: int) -> int:
             limit = limit if hardest == resource.RLIM_INFINITY else min(limit, hardest)
             resource.setrlimit(kind, (limit, limit))
     try:
-        mujoco.mj_saveModel(mujoco.MjModel.from_xml_path(path), result)
-    except (ValueError, RuntimeError, MemoryError) as error:
+        model = mujoco.MjModel.from_xml_path(path)
+        # Some models compile, and have no room for their own contacts.
+        mujoco.mj_forward(model, mujoco.MjData(model))
+        mujoco.mj_saveModel(model, result)
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
         sys.stdout.buffer.write(str(error).encode("utf-8", "replace"))
         return 1
     return 0

@@ -54,7 +54,7 @@ def compile_file(path: str | os.PathLike) -> mujoco.MjModel:
     if child.returncode != 1 or not said:
         said = f"a model on which MuJoCo's compiler ends (code {child.returncode}), or that takes too much"
         raise FileError(path, None, said, f"{_WANTED}, or more room (see --read-limit)")
-    raise FileError(path, None, f"what MuJoCo cannot compile ({said})", _WANTED)
+    raise FileError(path, None, f"what MuJoCo cannot compile or run ({said})", _WANTED)
 
 
 def check_files(path: str | os.PathLike) -> None:
