@@ -38,6 +38,7 @@ MODES = {
     "inf": lambda: jax.debug_infs(True),
     "leaks": jax.checking_leaks,
     "rank": lambda: jax.numpy_rank_promotion("raise"),
+    "no jit": jax.disable_jit,
 }
 
 
@@ -48,9 +49,3 @@ def test_the_same_answers(call, mode):
     with MODES[mode]():
         found = CALLS[call]()
     np.testing.assert_allclose(found, wanted, rtol=1e-9)
-
-
-def test_without_jit():
-    wanted = margin(grasps(3))
-    with jax.disable_jit():
-        np.testing.assert_allclose(margin(grasps(3)), wanted, rtol=1e-9)

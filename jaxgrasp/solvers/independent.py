@@ -102,6 +102,22 @@ def alike(leaves: Sequence[jax.Array], shared: Sequence[bool]) -> list[jax.Array
     ]  # fmt: skip
 
 
+def automatically(function: Callable[..., Tree], leaves: Sequence[jax.Array], shared: Sequence[bool]) -> Tree:
+    """A function of lanes, of which JAX need not know how each operation inside is divided.
+
+    Args:
+        function: of the leaves; returns leaves (lanes, ...).
+        leaves: (lanes, ...), or without the leading axis where shared.
+        shared: for every leaf.
+    """
+    given = alike(leaves, shared)
+    own = next((x for x, s in zip(given, shared, strict=True) if not s), None)
+    if own is None or not _explicit(own):
+        return function(*given)
+    with jax.sharding.use_abstract_mesh(jax.typeof(own).sharding.mesh):
+        return jax.sharding.auto_axes(function, out_sharding=PartitionSpec(_lead(own)))(*given)
+
+
 def _explicit(x: jax.Array) -> bool:
     return AxisType.Explicit in jax.typeof(x).sharding.mesh.axis_types
 

@@ -14,7 +14,7 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.records import record
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program, largest
-from jaxgrasp.solvers.independent import one_lane
+from jaxgrasp.solvers.independent import automatically, one_lane
 from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.qp_sensitivity import solution_of, value_at
 from jaxgrasp.solvers.status import Status
@@ -242,7 +242,8 @@ def solve_qp(
 @partial(compiled, static_argnums=(0, 1))
 def _solve_lanes(shared: tuple[bool, ...], batch: tuple[int, ...], lanes: Program) -> QPSolution:
     solve = jax.vmap(lambda *data: _solve_one(Program(*data)), in_axes=tuple(None if alone else 0 for alone in shared))
-    return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solve(*lanes))
+    solution = automatically(solve, lanes, shared)
+    return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solution)
 
 
 def _pair(
