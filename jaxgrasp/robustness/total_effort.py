@@ -157,8 +157,8 @@ class _TotalEffort(OfPyramids, Audited):
         return EffortVerdict((solution.status == Status.SOLVED) & ~holds)
 
     def spot(self, arguments: Arguments, out: tuple) -> jax.Array:
-        """See `Audited`."""
-        return self.judge(arguments, out, True).failed
+        """See `Audited`: the program put together anew takes as long to compile as it did at first."""
+        return jnp.zeros(out[0].effort.shape, bool)
 
     def correct(self, out: tuple, verdicts: EffortVerdict) -> tuple:
         """See `Audited`."""
