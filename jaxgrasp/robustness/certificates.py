@@ -10,8 +10,8 @@ with what rounding can have done to it: e is eps times the same sums over absolu
 have lost; signs being random, longer sums lose no more. sigma is off by about eps over what was left of the shortest
 row of G, as the pseudo-inverse is, and lambda* with it.
 
-In float64 E is exact to 1e-7 where the largest forces of a grasp spread over less than nine decades, and carrying N along
-would cost a tenth of a margin: points and bounds stay as they are.
+In float64 E is exact to 1e-7 where the largest forces of a grasp spread over less than nine decades, and carrying N
+along would cost a tenth of a margin: points and bounds stay as they are.
 """
 
 from typing import NamedTuple

@@ -244,6 +244,8 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record]:
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     point = balanced(program, problem, outcome.record.x)
     low, high = problem.attained(point.x), certified(program, problem, outcome.record)
+    # No point met E x = b within the rows.
+    low = jnp.where(jnp.isinf(outcome.record.lower), -jnp.inf, low)
     # Without a load, no forces at all are an answer with margin 0, exactly.
     accepted = _ACCEPTED_GAP[dtype.name]
     nothing = (low < 8 * jnp.finfo(dtype).eps) | ~point.exact & (low <= accepted)
