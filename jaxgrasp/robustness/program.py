@@ -260,6 +260,6 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
     if ratios.dtype == jnp.float64:
         return jnp.zeros(ratios.shape[1:], bool)
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
-    unreached = ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)
-    inside = reach <= 64 * jnp.finfo(reach.dtype).eps
-    return short | (~kept[:6].all(0) & ~grasps.lined) | unreached | ~inside & (reach <= tolerance)
+    doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
+    doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)
+    return doubtful if len(ratios) == 6 else doubtful | ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)

@@ -77,7 +77,7 @@ def audited(kernel: Any, out: Tree, contacts: Contacts, disturbances: Disturbanc
         if not int(failed):
             return out
         setting.report(int(failed), max(1, int(np.prod(jax.tree.leaves(verdicts)[0].shape))))
-    return kernel.correct(out, verdicts)
+    return _corrected(kernel, out, verdicts)
 
 
 @partial(compiled, static_argnums=(0, 1))
@@ -98,6 +98,11 @@ def _verdicts(
         verdicts = jax.tree.map(refuted, verdicts, spots, is_leaf=lambda x: hasattr(x, "failed"))
     failed = jnp.sum(jnp.stack([jnp.sum(verdict) for verdict in _flags(verdicts)]))
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), verdicts), failed
+
+
+@partial(compiled, static_argnums=(0,))
+def _corrected(kernel: Any, out: Tree, verdicts: Tree) -> Tree:
+    return kernel.correct(out, verdicts)
 
 
 def _refuted(verdict: Any, spots: jax.Array, turn: jax.Array, step: int) -> Any:

@@ -31,8 +31,8 @@ def audit(form: str) -> Iterator[None]:
 
     Args:
         form: "sampled", the default: every lane with the S_1 and S_2 that its solver used, and one lane in sixteen,
-            other ones at each call, with S_1 and S_2 computed anew; of the chain and (11) the forces alone; "strict": every lane with S_1 and S_2 computed
-            anew; "off": no audit.
+            other ones at each call, with S_1 and S_2 computed anew; of the chain and of (11) the forces alone.
+            "strict": every lane with everything computed anew. "off": no audit.
 
     Raises:
         ValueError: another form.
