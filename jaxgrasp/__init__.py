@@ -4,6 +4,8 @@ The package's names are those of `jaxgrasp.face`, which is imported when the fir
 to import, in which the command line could not answer Ctrl-C.
 """
 
+from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,9 +14,11 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    # Python itself looks for the face, and for names such as __path__.
-    if name == "face" or (name.startswith("__") and name != "__all__"):
+    # Python itself looks for names such as __path__, and for modules before it imports them.
+    if name.startswith("__") and name != "__all__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if find_spec(f"{__name__}.{name}") is not None:
+        return import_module(f"{__name__}.{name}")
     from jaxgrasp import face
 
     value = getattr(face, name)

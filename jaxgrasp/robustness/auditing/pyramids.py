@@ -93,7 +93,7 @@ def _judged(
     status, asked = solution.status, problem.margin
     scale = natural_scale(problem, rows)
     proven, refuted = _upper_bound(problem, evidence, rows)
-    proven = jnp.where(_flat(problem, solution, rows, place, proven), 0, proven)
+    proven = jnp.where(_flat(problem, solution, rows, place), 0, proven)
     holds, attained = _primal(problem, solution, rows)
     slack = CLOSED[dtype] * jnp.maximum(scale, jnp.abs(jnp.where(jnp.isfinite(attained), attained, 0)))
 
@@ -246,14 +246,14 @@ def _of_efforts(problem: Problem, evidence: Evidence | Solution, rows: Rows) -> 
     return more, (pull, value), (jnp.abs(residual) * effort_unit(problem)).sum(-1)
 
 
-def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None, proven: jax.Array) -> jax.Array:
+def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None) -> jax.Array:
     """Where the margin cannot be positive: a contact without friction has to slip, or wrenches lie outside the range.
 
     Without S_1 and S_2 of its own the audit takes the solver's word for the latter, where the rank allows it.
     """
     slips = ((problem.friction <= 0) & problem.present & (rows.cone.max(-1) > 1e-9 * rows_size(rows)[:, None])).any(-1)
-    claimed = (solution.upper_bound == 0) & jnp.isinf(proven)
-    outside = claimed & (solution.rank < 6) if place is None else place.disturbance_outside & place.rank_stands
+    claimed = (solution.upper_bound == 0) & (solution.rank < 6)
+    outside = claimed if place is None else place.disturbance_outside & place.rank_stands
     return slips | outside
 
 
