@@ -309,6 +309,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, I
         (program.wrench_outside, Status.INFEASIBLE, jnp.nan),
         (program.doubtful & program.disturbance_outside & bearable, Status.ILL_CONDITIONED, 0.0),
         (program.disturbance_outside & bearable, Status.SOLVED, 0.0),
+        (program.slippery & idle & ~program.doubtful, Status.SOLVED, 0.0),
         (program.undisturbed & bearable, Status.UNBOUNDED, jnp.inf),
         ((program.disturbance_outside | program.undisturbed) & hopeless, Status.INFEASIBLE, jnp.nan),
     ]
@@ -324,7 +325,7 @@ def _solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, I
     forces = program.forces(record.x[0]) * program.blocks.present[:, None]
     scale = program.scale
     # Where the program's optimum is not the margin, its multipliers say nothing.
-    told = ~(program.disturbance_outside | program.undisturbed | program.slippery & (low > 0))
+    told = ~(program.disturbance_outside | program.undisturbed | program.slippery & ((low > 0) | idle))
     multipliers = jnp.where(told, record.z[0] * scale / program.row_units(), 0)
     actuated = actuated_values(program, record.x, record, grasps.units, scale)
     for name, value in actuated.items():
