@@ -14,10 +14,9 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    # Python itself looks for names such as __path__, and for modules before it imports them.
     if name.startswith("__") and name != "__all__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if find_spec(f"{__name__}.{name}") is not None:
+    if find_spec(f"{__name__}.{name}"):
         return import_module(f"{__name__}.{name}")
     from jaxgrasp import face
 

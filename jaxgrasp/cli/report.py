@@ -202,6 +202,9 @@ def print_synthesis(
         low, middle, best = np.quantile(known, (0.1, 0.5, 1.0))
         table.add_row(label, f"{low:z.4g}", f"{middle:z.4g}", f"{best:z.4g}", f"{(known > 1e-4).mean():.1%}")
     console.print(table)
+    unverified = int((found.status == Status.NOT_VERIFIED).sum())
+    if unverified:
+        console.print(f"{unverified:,} not confirmed by the audit")
     _print_zeros(console, "synthesised with a margin of zero", why_zero)
     if written:
         console.print("written: " + ", ".join(map(str, written)), markup=False)

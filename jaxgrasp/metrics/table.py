@@ -17,6 +17,7 @@ from jaxgrasp.metrics.task import task_wrench
 from jaxgrasp.metrics.wrench_space import WrenchSpace
 from jaxgrasp.robustness import largest_disturbance
 from jaxgrasp.robustness.formulations import formulation_margin
+from jaxgrasp.solvers.status import Status
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +53,12 @@ class Metric:
 
 def _margin(contacts: Contacts, setting: Setting) -> jax.Array:
     found = largest_disturbance(contacts, setting.disturbances, cone_edges=setting.cone_edges, **setting.task)
-    return found.margin
+    return _verified(found.margin, found.status)
+
+
+def _verified(margin: jax.Array, status: jax.Array) -> jax.Array:
+    """The margin, NaN where the audit did not confirm the answer: such grasps count as the worst."""
+    return jnp.where(status == Status.NOT_VERIFIED, jnp.nan, margin)
 
 
 def _margin_of(formulation: str) -> Callable[[Contacts, Setting], jax.Array]:
@@ -64,7 +70,7 @@ def _margin_of(formulation: str) -> Callable[[Contacts, Setting], jax.Array]:
         )
         # A margin that its bounds do not tell from zero is rounding, by which grasps would be ranked.
         rounding = jnp.abs(found.margin) <= found.upper_bound - found.margin
-        return jnp.where(rounding, 0, found.margin)
+        return _verified(jnp.where(rounding, 0, found.margin), found.status)
 
     return value
 

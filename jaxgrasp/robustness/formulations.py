@@ -188,6 +188,10 @@ class Chain(Audited):
             for name, (solution, point) in out.items()
         }
 
+    def spot(self, arguments: Arguments, out: dict) -> dict[str, jax.Array]:
+        """See `Audited`."""
+        return {name: verdict.failed for name, verdict in self.judge(arguments, out, True).items()}
+
     def correct(self, out: dict, verdicts: dict[str, ChainVerdict]) -> dict:
         """See `Audited`."""
         changed = {}

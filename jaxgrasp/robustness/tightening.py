@@ -16,7 +16,7 @@ from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited
-from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge
+from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge, spot
 from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
 from jaxgrasp.robustness.certificates import balanced, certified
 from jaxgrasp.robustness.derivatives import CentralPoint, Point, central_kappa, centred, envelope_adjoint
@@ -201,6 +201,9 @@ class _Tightening(OfPyramids, Audited, ABC):
 
     def judge(self, arguments: Arguments, out: tuple[Solution, Evidence], anew: bool) -> Verdict:
         return judge(arguments, *out, anew, self.smooth)
+
+    def spot(self, arguments: Arguments, out: tuple[Solution, Evidence]) -> jax.Array:
+        return spot(arguments, *out)
 
     def correct(self, out: tuple[Solution, Evidence], verdicts: Verdict) -> tuple[Solution, Evidence]:
         return corrected(out[0], verdicts), out[1]

@@ -156,6 +156,10 @@ class _TotalEffort(OfPyramids, Audited):
             holds &= least_total_effort_stands(solution.effort, found[1] * unit, found[0] * unit, unit)
         return EffortVerdict((solution.status == Status.SOLVED) & ~holds)
 
+    def spot(self, arguments: Arguments, out: tuple) -> jax.Array:
+        """See `Audited`."""
+        return self.judge(arguments, out, True).failed
+
     def correct(self, out: tuple, verdicts: EffortVerdict) -> tuple:
         """See `Audited`."""
         solution, record = out

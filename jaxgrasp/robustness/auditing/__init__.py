@@ -23,7 +23,7 @@ from jaxgrasp.robustness.auditing.setting import audit
 __all__ = ["Audited", "audit", "audited", "hidden"]
 
 Tree = Any
-# Batches up to this size are recomputed whole: there is nothing to save.
+# Batches up to this size are looked at whole: there is nothing to save.
 _SMALL = 64
 
 
@@ -39,6 +39,10 @@ class Audited(ABC):
             out: the kernel's results.
             anew: with everything computed anew that the solver only claims to have used.
         """
+
+    @abstractmethod
+    def spot(self, arguments: Arguments, out: Tree) -> Tree:
+        """Where what the solver claims to have used is not what comes out anew: bool (lanes,) for each verdict."""
 
     @abstractmethod
     def correct(self, out: Tree, verdicts: Tree) -> Tree:
@@ -85,22 +89,23 @@ def _verdicts(
     lead = len(arguments.batch)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), out)
     lanes = jax.tree.leaves(flat)[0].shape[0]
-    verdicts = kernel.judge(arguments, flat, stride == 1 or lanes <= _SMALL)
-    if stride > 1 and lanes > _SMALL:
-        some = jax.tree.map(lambda x: every(x, turn, stride), flat)
-        verdicts = jax.tree.map(
-            partial(_merged, turn), verdicts, kernel.judge(picked(arguments, turn, stride), some, True)
-        )
+    verdicts = kernel.judge(arguments, flat, stride == 1)
+    if stride > 1:
+        step = stride if lanes > _SMALL else 1
+        some = jax.tree.map(lambda x: every(x, turn % step, step), flat)
+        spots = kernel.spot(picked(arguments, turn % step, step), some)
+        refuted = partial(_refuted, turn=turn % step, step=step)
+        verdicts = jax.tree.map(refuted, verdicts, spots, is_leaf=lambda x: hasattr(x, "failed"))
     failed = jnp.sum(jnp.stack([jnp.sum(verdict) for verdict in _flags(verdicts)]))
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), verdicts), failed
 
 
-def _merged(turn: jax.Array, coarse: jax.Array, fine: jax.Array) -> jax.Array:
-    """Verdicts on all lanes with those on lane `turn` of every stride in their place."""
-    stride = coarse.shape[0] // fine.shape[0]
-    blocks = coarse[: fine.shape[0] * stride].reshape(-1, stride)
-    blocks = jnp.where(jnp.arange(stride, dtype=turn.dtype) == turn, fine[:, None], blocks).reshape(-1)
-    return jnp.concatenate([blocks, coarse[blocks.shape[0] :]])
+def _refuted(verdict: Any, spots: jax.Array, turn: jax.Array, step: int) -> Any:
+    """A verdict with what was found on lane `turn` of every `step`; nothing is confirmed there."""
+    blocks = spots[:, None] & (jnp.arange(step, dtype=turn.dtype) == turn)
+    wrong = jnp.zeros_like(verdict.failed).at[: blocks.size].set(blocks.reshape(-1))
+    unknown = {name: hidden(getattr(verdict, name), wrong, jnp.nan) for name in verdict._fields if name != "failed"}
+    return verdict._replace(failed=verdict.failed | wrong, **unknown)
 
 
 def _flags(verdicts: Tree) -> list[jax.Array]:

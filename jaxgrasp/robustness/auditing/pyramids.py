@@ -70,6 +70,30 @@ def judge(arguments: Arguments, solution: Solution, evidence: Evidence, anew: bo
     return _judged(problem, solution, evidence, rows, place, smooth)
 
 
+def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Array:
+    """Where S_1 and S_2 are not those that the solver used, or the set does not lie where it claims, (lanes,)."""
+    problem, used = problem_of(arguments), evidence.rows
+    rows, place = own_rows(problem, solution.cone_multipliers.shape[-1], solution.rank)
+    # What counts is what a row loses at the margin, or at the disturbance that takes a whole row by itself.
+    force, there = problem.max_force, problem.present
+    taken = jnp.maximum(used.cone.max(-1) / jnp.where(problem.friction > 0, problem.friction, jnp.inf), used.bound)
+    taken = jnp.where(there, taken / force, 0).max(-1)
+    margin = jnp.where(jnp.isfinite(solution.margin), jnp.abs(solution.margin), 0)
+    margin = jnp.maximum(margin, jnp.where(taken > 0, 1 / jnp.where(taken > 0, taken, 1), 0))[:, None]
+    near = 4 * MISSED[margin.dtype.name]
+    apart = margin * jnp.maximum(jnp.abs(rows.cone - used.cone).max(-1), jnp.abs(rows.bound - used.bound))
+    right = ((apart <= near * force) | ~there).all(-1) & place.rank_stands
+    if problem.hand is not None:
+        right &= (margin * jnp.abs(rows.effort - used.effort).max(1) <= near * effort_unit(problem)).all(-1)
+    # Where the set is said to reach outside, and neither multipliers nor contacts without friction bound the margin.
+    proven = jnp.where(_slips(problem, used), 0, _upper_bound(problem, evidence, used)[0])
+    unproven = proven > CLOSED[margin.dtype.name] * natural_scale(problem, used)
+    flat = (solution.status == Status.SOLVED) & _claims_flat(solution)
+    # Rows of wrenches outside the range mean nothing; where only that makes the margin zero, they have to be outside.
+    right = jnp.where(flat & place.disturbance_outside, place.rank_stands, right & ~(flat & unproven))
+    return (solution.status != Status.INVALID_INPUT) & jnp.isfinite(solution.upper_bound) & ~right
+
+
 def corrected(solution: Solution, verdict: Verdict) -> Solution:
     """The solution with what the audit confirms in place of what it does not."""
     instead = {
@@ -251,10 +275,19 @@ def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None)
 
     Without S_1 and S_2 of its own the audit takes the solver's word for the latter, where the rank allows it.
     """
-    slips = ((problem.friction <= 0) & problem.present & (rows.cone.max(-1) > 1e-9 * rows_size(rows)[:, None])).any(-1)
-    claimed = (solution.upper_bound == 0) & (solution.rank < 6)
-    outside = claimed if place is None else place.disturbance_outside & place.rank_stands
-    return slips | outside
+    outside = _claims_flat(solution) if place is None else place.disturbance_outside & place.rank_stands
+    return _slips(problem, rows) | outside
+
+
+def _slips(problem: Problem, rows: Rows) -> jax.Array:
+    """Where a contact without friction would have to bear a tangential force, (lanes,)."""
+    loses = rows.cone.max(-1) > 1e-9 * rows_size(rows)[:, None]
+    return ((problem.friction <= 0) & problem.present & loses).any(-1)
+
+
+def _claims_flat(solution: Solution) -> jax.Array:
+    """Where the set is said to reach outside the range of G, (lanes,)."""
+    return (solution.upper_bound == 0) & (solution.rank < 6)
 
 
 def _outside(solution: Solution, place: Range | None) -> jax.Array:
