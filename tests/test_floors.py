@@ -1,6 +1,8 @@
 """The package is a house with floors: a room imports only from rooms below it, read from the imports themselves."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -112,3 +114,8 @@ def test_a_wrong_import_is_seen(room, source):
 )
 def test_a_right_import_passes(room, source):
     assert violations(room, imports(source, f"jaxgrasp.{room}")) == []
+
+
+@pytest.mark.parametrize("module", ["solvers", "robustness.auditing", "ranking"])
+def test_a_module_can_be_the_first_that_is_imported(module):
+    subprocess.run([sys.executable, "-c", f"import jaxgrasp.{module}"], check=True)

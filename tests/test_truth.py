@@ -12,17 +12,27 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import jaxgrasp as jg  # noqa: E402
 from benchmarks import truth  # noqa: E402
 from benchmarks.suite import families, lanes, rules  # noqa: E402
 from benchmarks.suite.grasps import DIRECTIONS  # noqa: E402
 from benchmarks.suite.lanes import Claims, Lanes  # noqa: E402
 from benchmarks.suite.rows import TOLERANCES  # noqa: E402
 from benchmarks.suite.truth_report import faults, report  # noqa: E402
+from jaxgrasp.robustness.auditing import setting  # noqa: E402
 
 CONTACTS, EACH = 4, 96
 # Sets that are smoothed are another program: they have a test of their own.
 SAMPLED = [name for name in families.FAMILIES if name != "smoothed sets"]
 TOLERANCE = TOLERANCES["float64"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_consequences():
+    """An audit that fails, as it may for forces over sixteen decades, leaves the kernels to the tests that follow."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(setting, "report", lambda failed, lanes: None)
+        yield
 
 
 def alike(name: str) -> Lanes:
@@ -74,6 +84,14 @@ def test_a_sample_of_all_families_is_true(sample, solved):
                 f"{program} {rule}: {dict(zip(*np.unique(family[bad], return_counts=True), strict=True))}"
             )
     assert found["margin"].solved.mean() > 0.8
+
+
+def test_what_is_true_is_verified(sample, solved):
+    """The audit may doubt lanes that are at the end of what float64 can tell, but no others."""
+    far = np.isin(np.repeat(SAMPLED, EACH), ["8 decades", "16 decades", "nearly degenerate"])
+    for answer in solved[:2]:
+        assert not ((answer.status == rules.NOT_VERIFIED) & ~far).any()
+    assert np.isin(solved[0].status, [jg.Status.MAX_ITERATIONS, jg.Status.ILL_CONDITIONED])[~far].mean() < 3e-3
 
 
 def test_spoilt_lanes_are_marked_and_harm_nobody(sample, solved):
