@@ -2,7 +2,7 @@
 
 Every command is started anew in a folder of its own; half of the signals come within the first second. What was written
 has to be whole. A command that was done before its signal came does not count. Before Python has reached the command's
-first line (some 40 ms) a signal ends it as it ends any Python program: such moments are drawn from 0.1 s on.
+first line a signal ends it as it ends any Python program: moments are drawn from 0.1 s on, which busy machines exceed.
 
     python -m benchmarks.assaults.interrupted [--count 20] [--output interrupted.md]
 """

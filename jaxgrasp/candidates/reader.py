@@ -162,7 +162,7 @@ def _travelling(path: Path, arrays: dict[str, np.ndarray], count: int) -> dict[s
     columns = {}
     for name, value in arrays.items():
         known = name in FIELDS and name != "center_of_mass"
-        if known or value.ndim == 0 or value.shape[0] != count:
+        if known or value.size == 0 or value.ndim == 0 or value.shape[0] != count:
             continue
         if value.dtype.kind == "S":
             value = np.char.decode(value, "utf-8", "replace")

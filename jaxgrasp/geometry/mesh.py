@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from jaxgrasp.geometry.grid import DistanceGrid
 from jaxgrasp.geometry.triangles import signed_distances
-from jaxgrasp.storage import FileError, open_regular
+from jaxgrasp.storage import FileError, open_regular, printable
 
 MESH_ENDINGS = (".stl", ".obj", ".ply")
 # Nodes beyond the mesh on every side: the spline's support, and room for points on their way back to the surface.
@@ -23,6 +23,10 @@ _COST = 10
 
 class MeshError(ValueError):
     """A mesh cannot be used. The message is one line: file, what came, what is wanted."""
+
+    def __init__(self, message: str):
+        """Makes it one line, whatever the file is called."""
+        super().__init__(printable(message))
 
 
 @dataclass(frozen=True, kw_only=True)

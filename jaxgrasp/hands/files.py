@@ -19,8 +19,8 @@ import mujoco
 from jaxgrasp.storage import FileError, allowance, open_regular
 
 _WANTED = "a model in MJCF or URDF"
-# The compiler may have a quarter of the budget, beside what it takes itself, and three seconds for each GiB of it.
-_SHARE, _OWN, _SECONDS = 4, 300 << 20, 3.0
+# The compiler may have an eighth of the budget, beside what it takes itself, and three seconds for each GiB of it.
+_SHARE, _OWN, _SECONDS = 8, 250 << 20, 3.0
 # On the clock, for whatever keeps it waiting without computing.
 _PATIENCE = 60.0
 # Elements of XML take more than their text.

@@ -154,7 +154,8 @@ def open_archive(path: Path | str, wanted: str = "an .npz file (numpy.savez)") -
     with open_regular(path, wanted) as stream:
         try:
             magic = stream.read(len(_MAGIC))
-            if not zipfile.is_zipfile(stream):
+            # zipfile would also find an archive behind something else, which NumPy takes for no archive.
+            if not magic.startswith(b"PK") or not zipfile.is_zipfile(stream):
                 _refuse_kind(path, magic, wanted)
             archive = zipfile.ZipFile(_Bounded(stream))  # type: ignore[arg-type]
         except FileError:

@@ -1,0 +1,76 @@
+"""Malformed files by the hundred, as readers and writers of tables take them; the whole study is under benchmarks."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.assaults import arrays  # noqa: E402
+from benchmarks.assaults.inputs import cases  # noqa: E402
+from jaxgrasp.candidates import CandidateError, Candidates, read_candidates, read_wrenches  # noqa: E402
+from jaxgrasp.geometry import Mesh, MeshError  # noqa: E402
+from jaxgrasp.ranking import Ranking, write_table  # noqa: E402
+
+
+def candidates(path: Path, folder: Path) -> None:
+    found = read_candidates([path], friction=0.6, max_force=10.0)
+    with np.load(path, allow_pickle=False) as theirs:
+        np.testing.assert_array_equal(found.positions, theirs["positions"].astype(float))
+    for ending in (".parquet", ".csv", ".npz"):
+        write_table(ranking(found), folder / f"table{ending}")
+
+
+def ranking(found: Candidates) -> Ranking:
+    none = np.zeros((0, found.num_contacts, 3))
+    return Ranking(
+        candidates=found,
+        margin=np.zeros(len(found)),
+        upper_bound=np.zeros(len(found)),
+        status=np.zeros(len(found), int),
+        order=np.arange(len(found)),
+        share=0.75,
+        forces=none,
+        object_forces=none,
+        effort=np.zeros(0),
+        tightening_status=np.zeros(0, int),
+        controls=np.zeros((0, 0)),
+    )
+
+
+def wrenches(path: Path, folder: Path) -> None:
+    found, theirs = read_wrenches(path), np.load(path, allow_pickle=False)
+    np.testing.assert_array_equal(found, (theirs["wrenches"] if hasattr(theirs, "files") else theirs).astype(float))
+
+
+def mesh(path: Path, folder: Path) -> None:
+    assert np.isfinite(Mesh.from_file(path).vertices).all()
+
+
+READERS: dict[str, Callable[[Path, Path], None]] = {
+    "npz": candidates,
+    "npy": wrenches,
+    "stl": mesh,
+    "obj": mesh,
+    "ply": mesh,
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", READERS)
+def test_every_malformed_file_is_refused_in_one_line_or_has_its_meaning(tmp_path, monkeypatch, kind):
+    # Gigabytes of zeros take long to write; test_storage has some.
+    monkeypatch.setattr(arrays, "bomb", lambda *_: b"")
+    refused = 0
+    for case in cases(tmp_path / "inputs", kind):
+        try:
+            READERS[kind](case.path, tmp_path)
+        except (CandidateError, MeshError) as error:
+            refused += 1
+            assert str(error).isprintable(), case.name
+        except Exception as error:
+            raise AssertionError(f"{case.name}: {type(error).__name__}") from error
+    assert refused > 50
