@@ -105,6 +105,7 @@ def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, It
         (program.wrench_outside, Status.INFEASIBLE, jnp.nan),
         (program.doubtful & program.disturbance_outside & bearable, Status.ILL_CONDITIONED, 0.0),
         (program.disturbance_outside & bearable, Status.SOLVED, 0.0),
+        (program.slippery & idle & ~program.doubtful, Status.SOLVED, 0.0),
         (program.undisturbed & bearable, Status.UNBOUNDED, jnp.inf),
         ((program.disturbance_outside | program.undisturbed) & hopeless, Status.INFEASIBLE, jnp.nan),
     ]
@@ -120,7 +121,7 @@ def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, It
     forces = program.forces(record.x[0]) * program.blocks.present[:, None]
     scale = program.scale
     # Where the program's optimum is not the margin, its multipliers say nothing.
-    told = ~(program.disturbance_outside | program.undisturbed | program.slippery & (low > 0))
+    told = ~(program.disturbance_outside | program.undisturbed | program.slippery & ((low > 0) | idle))
     multipliers = jnp.where(told, record.z[0] * scale / program.row_units(), 0)
     actuated = actuated_values(program, record.x, record, grasps.units, scale)
     for name, value in actuated.items():
