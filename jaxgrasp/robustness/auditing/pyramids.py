@@ -129,7 +129,7 @@ def _judged(
     if not smooth:
         solved &= upper - margin <= slack if asked is None else _least(problem, solution, rows)
     idle = holds & (attained == jnp.inf) & (margin == jnp.inf)
-    unbearable = refuted | jnp.isnan(margin) & _outside(solution, place)
+    unbearable = refuted | jnp.isnan(margin) & _outside(problem, solution, place)
     if asked is not None:
         unbearable |= proven < asked
     stands = jnp.select(
@@ -290,9 +290,10 @@ def _claims_flat(solution: Solution) -> jax.Array:
     return (solution.upper_bound == 0) & (solution.rank < 6)
 
 
-def _outside(solution: Solution, place: Range | None) -> jax.Array:
-    """Where b lies outside the range of G."""
-    return solution.rank < 6 if place is None else place.wrench_outside & place.rank_stands
+def _outside(problem: Problem, solution: Solution, place: Range | None) -> jax.Array:
+    """Where b lies outside the range of G, or of what G has left where contacts have no friction, (lanes,)."""
+    slippery = ((problem.friction < 1e-6) & problem.present).any(-1)
+    return slippery | (solution.rank < 6 if place is None else place.wrench_outside & place.rank_stands)
 
 
 def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
