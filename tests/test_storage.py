@@ -2,8 +2,9 @@
 
 import io
 import os
-import signal
 import struct
+import subprocess
+import sys
 import time
 import zipfile
 from pathlib import Path
@@ -109,33 +110,36 @@ def test_what_cannot_be_written(tmp_path, kind):
     assert os.listdir(tmp_path) == before
 
 
-def test_litter_of_the_dead_is_swept_and_that_of_the_living_is_not(tmp_path):
-    def begun() -> int:
-        child = os.fork()
-        if child == 0:
-            with atomic_write(tmp_path / "file") as stream:
-                stream.write(b"x")
-                stream.flush()
-                time.sleep(60)
-            os._exit(0)
-        return child
+WRITING = """
+import sys, time
+from jaxgrasp.storage import atomic_write
+with atomic_write(sys.argv[1]) as stream:
+    stream.write(b"x")
+    stream.flush()
+    time.sleep(60)
+"""
 
+
+def test_litter_of_the_dead_is_swept_and_that_of_the_living_is_not(tmp_path):
     def parts() -> int:
         return sum(name.endswith(".part") for name in os.listdir(tmp_path))
 
-    living = begun()
-    while parts() < 1:
-        time.sleep(0.01)
-    dead = begun()
-    while parts() < 2:
-        time.sleep(0.01)
-    os.kill(dead, signal.SIGKILL)
-    os.waitpid(dead, 0)
+    def begun(number: int) -> subprocess.Popen:
+        child = subprocess.Popen([sys.executable, "-c", WRITING, str(tmp_path / "file")])
+        while parts() < number:
+            time.sleep(0.01)
+        return child
+
+    def kill(child: subprocess.Popen) -> None:
+        child.kill()
+        child.wait()
+
+    living = begun(1)
+    kill(begun(2))
     assert parts() == 2
     write(tmp_path / "file", b"mine")
     assert parts() == 1
-    os.kill(living, signal.SIGKILL)
-    os.waitpid(living, 0)
+    kill(living)
     write(tmp_path / "file", b"mine")
     assert os.listdir(tmp_path) == ["file"]
 
