@@ -66,7 +66,10 @@ def problem_of(arguments: Arguments) -> Problem:
     )
     positions, friction, max_force = here("positions", 0), here("friction", 0), here("max_force", 1)
     count = jnp.maximum(present.sum(-1), 1).astype(positions.dtype)
-    square = (positions * positions).sum((-2, -1)) / count
+    # In units of the largest, whose square may be more, or less, than there are numbers for.
+    largest = jnp.abs(positions).max((-2, -1))
+    largest = jnp.where(largest > 0, largest, 1)
+    square = ((positions / largest[:, None, None]) ** 2).sum((-2, -1)) / count
     last = {name: jnp.moveaxis(x, 0, -1) for name, x in leaves.items() if name.startswith("term")}
     terms = arguments.terms(last)
     strongest = jnp.where(present, max_force, 0)
@@ -76,7 +79,7 @@ def problem_of(arguments: Arguments) -> Problem:
         friction=friction,
         max_force=max_force,
         present=present,
-        size=jnp.sqrt(jnp.where(square > 0, square, 1)),
+        size=largest * jnp.sqrt(jnp.where(square > 0, square, 1)),
         wrench=leaves["wrench"],
         reserve=leaves["reserve"],
         terms=terms,

@@ -27,7 +27,7 @@ from jaxgrasp.solvers.status import Status
 MISSED = {"float64": 5e-8, "float32": 1.5e-5}
 CLOSED = {"float64": 2e-7, "float32": 2e-4}
 # Forces below this share of the largest are rounding.
-_NOTHING = {"float64": 1e-8, "float32": 1e-3}
+_NOTHING = {"float64": 1e-15, "float32": 1e-6}
 
 
 class Evidence(NamedTuple):
