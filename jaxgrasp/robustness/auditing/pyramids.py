@@ -127,6 +127,8 @@ def _judged(
     if asked is not None:
         solved &= asked <= attained
     if not smooth:
+        # A margin below zero proves that b cannot be borne.
+        solved &= margin >= -slack
         solved &= upper - margin <= slack if asked is None else _least(problem, solution, rows)
     idle = holds & (attained == jnp.inf) & (margin == jnp.inf)
     unbearable = refuted | jnp.isnan(margin) & _outside(problem, solution, place)
