@@ -16,6 +16,8 @@ jax.config.update("jax_num_cpu_devices", 2)
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
 
+from jaxgrasp.kernels import native  # noqa: E402
+
 # Compilation is part of the first example's time, and the same examples every time make a failure repeatable.
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)
 hypothesis.settings.load_profile("repeatable")
@@ -33,3 +35,9 @@ def compilations():
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield seen
     jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.fixture(autouse=True)
+def trust(monkeypatch):
+    """One test's answer that the audit does not confirm takes no kernels from the others."""
+    monkeypatch.setattr(native, "_trusted", True)
