@@ -66,7 +66,8 @@ def candidates_of_grasps(
 
 
 def _table(path: Path) -> dict[str, np.ndarray]:
-    from jaxgrasp.candidates import CandidateError, read_archive
+    from jaxgrasp.candidates import CandidateError
+    from jaxgrasp.storage import read_archive
 
     try:
         table = read_archive(path)
