@@ -115,10 +115,12 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
     product = partial(jnp.einsum, precision="highest")
     squares = lambda x: product("...k,...k->...", x[..., :width], x[..., :width])  # noqa: E731
     # The rows and, beside them, the row operations that led to them: small products are fast with lanes leading.
-    # Made like the rows, so that they vary over the same axes of a mesh.
-    nothing = jnp.zeros_like(rows, shape=(lanes, count, count))
-    start = jnp.ones_like(rows, shape=(lanes, count), dtype=bool), jnp.ones_like(rows, shape=(lanes,), dtype=bool)
-    rows = jnp.concatenate([jnp.moveaxis(rows, -1, 0), nothing + jnp.eye(count, dtype=dtype)], 2)
+    rows = jnp.moveaxis(rows, -1, 0)
+    # Made of the rows, so that they vary, and are divided, over the same axes of a mesh.
+    none = rows[:, :, :1] * 0
+    nothing = jnp.broadcast_to(none, (lanes, count, count))
+    left = (none[:, :, 0] == 0) | True
+    rows = jnp.concatenate([rows, nothing + jnp.eye(count, dtype=dtype)], 2)
     longest = jnp.sqrt(squares(rows).max(1))
     least, most = (share * longest for share in _DOUBTFUL[dtype.name])
 
@@ -137,7 +139,7 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
         null = lax.dynamic_update_index_in_dim(null, jnp.where(kept[:, None], 0, row[:, width:])[:, None], j, 1)
         return rows - share[:, :, None] * unit[:, None], basis, null, left & ~pivot, stands
 
-    _, basis, null, _, stands = lax.fori_loop(0, count, step, (rows, jnp.zeros_like(rows), nothing, *start))
+    _, basis, null, _, stands = lax.fori_loop(0, count, step, (rows, jnp.zeros_like(rows), nothing, left, left[:, 0]))
     inverse = product("ljk,ljr->krl", basis[..., :width], basis[..., width:])
     return Echelon(inverse, jnp.moveaxis(null, 0, -1), stands | (rank is None))
 
