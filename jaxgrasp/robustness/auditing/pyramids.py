@@ -134,11 +134,10 @@ def _judged(
     unbearable = refuted | jnp.isnan(margin) & _outside(problem, solution, place)
     if asked is not None:
         unbearable |= proven < asked
-    stands = jnp.select(
-        [status == Status.SOLVED, status == Status.UNBOUNDED, status == Status.INFEASIBLE, status == Status.PRUNED],
-        [solved, idle, unbearable, bounded],
-        True,
-    )
+    stands = (status != Status.SOLVED) | solved
+    stands &= (status != Status.UNBOUNDED) | idle
+    stands &= (status != Status.INFEASIBLE) | unbearable
+    stands &= (status != Status.PRUNED) | bounded
     confirmed = jnp.where(holds & (attained > -jnp.inf), attained, jnp.nan)
     return Verdict(~stands, confirmed, jnp.where(jnp.isnan(proven), jnp.inf, proven))
 

@@ -207,7 +207,7 @@ def _range(problem: Problem, plain: Echelon) -> Range:
 
 def _units(size: jax.Array) -> jax.Array:
     """(6, lanes), what turns wrenches in N and N m to newtons."""
-    return jnp.stack([jnp.ones_like(size)] * 3 + [1 / size] * 3)
+    return jnp.stack([size / size] * 3 + [1 / size] * 3)
 
 
 def _alike(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
