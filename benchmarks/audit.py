@@ -100,8 +100,8 @@ def main() -> None:
     rows = [row for dtype in (np.float64, np.float32) for row in measure(dtype)]
     text = f"""# What the audit costs
 
-`python -m benchmarks.audit`, {platform.processor() or platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}, load average {load:.1f} before.
-{BATCH:,} grasps of {CONTACTS} contacts, six forces, best of {ROUNDS} rounds by turns; in brackets what is added as a share of the solve.
+`python -m benchmarks.audit`, {platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}, load {load:.1f}.
+{BATCH:,} grasps of {CONTACTS} contacts, six forces, best of {ROUNDS} rounds by turns; in brackets, of the solve.
 
 | precision | program | off, ms | sampled adds, ms | strict adds, ms |
 |---|---|---|---|---|

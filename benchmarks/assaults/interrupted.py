@@ -45,7 +45,7 @@ def whole(path: Path) -> bool:
 
 
 def once(arguments: list[str], number: int, moment: float, home: Path) -> tuple[str, str]:
-    """What became of one, in a word, and what it said."""
+    """The outcome of one input in a word, and what the command printed."""
     for path in home.iterdir():
         if path.name != "grasps.npz":
             path.unlink()
