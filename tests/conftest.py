@@ -17,6 +17,7 @@ import hypothesis  # noqa: E402
 import pytest  # noqa: E402
 
 from jaxgrasp.kernels import native  # noqa: E402
+from jaxgrasp.robustness.auditing import setting  # noqa: E402
 
 # Compilation is part of the first example's time, and the same examples every time make a failure repeatable.
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)
@@ -39,5 +40,6 @@ def compilations():
 
 @pytest.fixture(autouse=True)
 def trust(monkeypatch):
-    """One test's answer that the audit does not confirm takes no kernels from the others."""
+    """One test's answer that the audit does not confirm takes no kernels, and no warning, from the others."""
     monkeypatch.setattr(native, "_trusted", True)
+    monkeypatch.setattr(setting, "_warned", False)

@@ -82,10 +82,11 @@ def test_parallel_jaws_in_float32():
 
 
 def test_float32_says_that_it_cannot_tell_the_rank():
-    """Three points on a line to within rounding: the rank is 5 or 6, and the margin 1.8 or 1.5 of something."""
+    """Three points hardly off a line: the rank is 5 or 6, and the margin 1.8 or 1.5 of something."""
     rng = np.random.default_rng(4)
     line, along = problems.unit_vectors(rng, 16), rng.uniform(-0.05, 0.05, (16, 3))
-    positions = (line[:, None] * along[..., None]).astype(np.float32)
+    off = 3e-7 * rng.uniform(-1, 1, (16, 3, 3))
+    positions = (line[:, None] * along[..., None] + off).astype(np.float32)
     contacts = jg.Contacts.from_normals(positions, positions, friction=0.5, max_force=2.0)
     assert np.all(np.asarray(jg.largest_disturbance(contacts, SIX).status) == jg.Status.ILL_CONDITIONED)
     axis = np.array([[-0.05, 0, 0], [0.02, 0, 0], [0.05, 0, 0]], np.float32)
@@ -93,8 +94,10 @@ def test_float32_says_that_it_cannot_tell_the_rank():
     assert jg.largest_disturbance(contacts, SIX).status == jg.Status.SOLVED
 
 
+@pytest.mark.filterwarnings("ignore:.* answers failed the audit")
 @pytest.mark.parametrize("decades", [12, 16])
 def test_bounds_of_float64_do_not_cross(decades):
+    """Forces that spread so far miss G f = b by more than the audit allows in some lanes."""
     ours = margins("float64", *spread(np.random.default_rng(5), 3, decades))
     solved = np.asarray(ours.status == jg.Status.SOLVED)
     assert solved.mean() > 0.4

@@ -27,6 +27,8 @@ from jaxgrasp.solvers.interior_point import Iterate
 
 # Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
 LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
+# The most that dropping rows may turn those that are kept: as much as rows of an answer may be missed by.
+_TURNED = 1e-7
 
 
 class Equalities(NamedTuple):
@@ -81,7 +83,7 @@ class Program:
     least_ratio: jax.Array
     """What was left of the shortest row of G that counts, in lengths of the longest, (*lanes)."""
     doubtful: jax.Array
-    """bool (*lanes): float32 cannot tell the rank."""
+    """bool (*lanes): the rank cannot be told, see `_doubtful`."""
     undisturbed: jax.Array
     """bool (*lanes): S_1 = S_2 = 0."""
     disturbance_outside: jax.Array
@@ -249,16 +251,19 @@ def actuated_values(
 
 
 def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) -> jax.Array:
-    """Where float32 cannot tell the rank, or what is in the range, or rounding makes much of a short row.
+    """Where the rank cannot be told, or what is in the range, or rounding makes much of a short row.
 
-    A row that is nearly dependent makes S_1 and S_2 wrong by eps over what was left of it. One that was dropped may be
-    dependent or not, unless the contacts themselves say so: all on one line, to the last bit. A disturbance set that
-    leaves the range by little more than rounding has margin 0, or none of it at all. Rows of joints that no actuator
-    reaches are dependent where they look so. float64 is fine enough to decide.
+    What is dropped turns what is kept by its share of the shortest row that stays. float64 is fine enough for all else.
+
+    In float32 a row that is nearly dependent makes S_1 and S_2 wrong by eps over what was left of it. One that was
+    dropped may be dependent or not, unless the contacts themselves say so: all on one line, to the last bit. A
+    disturbance set that leaves the range by little more than rounding has margin 0, or none of it at all. Rows of
+    joints that no actuator reaches are dependent where they look so.
     """
     ratios, kept = basis.ratios, basis.kept > 0
     if ratios.dtype == jnp.float64:
-        return jnp.zeros(ratios.shape[1:], bool)
+        least = fold(jnp.minimum, jnp.where(kept, ratios, 1)[:6])
+        return fold(jnp.maximum, jnp.where(kept, 0, ratios)[:6]) > _TURNED * least
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
     doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
     doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)

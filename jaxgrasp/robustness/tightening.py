@@ -68,8 +68,8 @@ def largest_disturbance(
 
     Status:
         SOLVED; INFEASIBLE (b cannot be borne); UNBOUNDED (nothing disturbs, margin inf); INVALID_INPUT (data not
-        admissible, for that grasp alone); PRUNED (below the cutoff); MAX_ITERATIONS, ILL_CONDITIONED (float32 cannot
-        tell). With smoothing, SOLVED means that the central point was found; its margin may be negative, which then
+        admissible, for that grasp alone); PRUNED (below the cutoff); MAX_ITERATIONS, ILL_CONDITIONED (the rank cannot
+        be told). With smoothing, SOLVED means that the central point was found; its margin may be negative, which then
         proves nothing.
 
     Derivatives:

@@ -29,7 +29,7 @@ _ADVICE = {
     Status.INFEASIBLE: "No admissible point exists; a negative margin or a certificate proves it.",
     Status.UNBOUNDED: "The objective has no bound: for a grasp, nothing disturbs it.",
     Status.MAX_ITERATIONS: "Not solved to the tolerance; the bounds still hold. Use float64 or rescale the data.",
-    Status.ILL_CONDITIONED: "The rank of the grasp map cannot be told in this precision; use float64.",
+    Status.ILL_CONDITIONED: "The rank of the grasp map cannot be told in this precision; in float32, use float64.",
     Status.INVALID_INPUT: "The data of this element are not admissible (NaN, zero normal, negative friction ...).",
     Status.PRUNED: "Given up early, since its upper bound is below the cutoff; the bounds hold.",
     Status.NOT_VERIFIED: "The audit could not confirm the answer; its margin is what it confirms, or NaN. Use float64.",

@@ -91,7 +91,8 @@ def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Ar
     flat = (solution.status == Status.SOLVED) & _claims_flat(solution)
     # Rows of wrenches outside the range mean nothing; where only that makes the margin zero, they have to be outside.
     right = jnp.where(flat & place.disturbance_outside, place.rank_stands, right & ~(flat & unproven))
-    return (solution.status != Status.INVALID_INPUT) & jnp.isfinite(solution.upper_bound) & ~right
+    claims = (solution.status <= Status.UNBOUNDED) | (solution.status == Status.PRUNED)
+    return claims & jnp.isfinite(solution.upper_bound) & ~right
 
 
 def corrected(solution: Solution, verdict: Verdict) -> Solution:
