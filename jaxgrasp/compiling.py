@@ -13,6 +13,8 @@ from jaxgrasp import process
 # Loops over lanes are vectors already as XLA writes them: LLVM's costlier passes take long and gain nothing, while the
 # widest registers, which LLVM is shy of, do. Both options are internals of XLA.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
+# A third of the time to compile, six times as long to run: for what has little to run.
+_SOON = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 @contextlib.contextmanager
@@ -22,16 +24,23 @@ def own_settings() -> Iterator[None]:
         yield
 
 
-def compiled(function: Callable[..., Any], static_argnums: tuple[int, ...] = ()) -> Callable[..., Any]:
+def compiled(
+    function: Callable[..., Any], static_argnums: tuple[int, ...] = (), soon: bool = False
+) -> Callable[..., Any]:
     """`jax.jit` with the options that suit this library's kernels, where it is the outermost one.
 
     JAX takes options for whole programs only: inside somebody's transformation theirs apply.
+
+    Args:
+        function: what to compile.
+        static_argnums: as for `jax.jit`.
+        soon: compile fast rather than well.
     """
     inner = jax.jit(function, static_argnums=static_argnums)
 
     @functools.cache
     def outer() -> Callable[..., Any]:
-        return jax.jit(function, static_argnums=static_argnums, compiler_options=options())
+        return jax.jit(function, static_argnums=static_argnums, compiler_options=options(soon))
 
     @functools.wraps(function)
     def call(*args: Any) -> Any:
@@ -49,12 +58,13 @@ def compiled(function: Callable[..., Any], static_argnums: tuple[int, ...] = ())
 
 
 @functools.cache
-def options() -> dict[str, Any] | None:
+def options(soon: bool = False) -> dict[str, Any] | None:
     """`compiler_options` for `jax.jit`; None on other than CPUs, and where XLA no longer knows them."""
+    wanted = _SOON if soon else _OPTIONS
     if jax.default_backend() != "cpu":
         return None
     try:
-        jax.jit(lambda x: x, compiler_options=_OPTIONS).lower(0.0).compile()
+        jax.jit(lambda x: x, compiler_options=wanted).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
         return None
-    return _OPTIONS
+    return wanted

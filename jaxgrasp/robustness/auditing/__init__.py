@@ -25,6 +25,8 @@ __all__ = ["Audited", "audit", "audited", "hidden"]
 Tree = Any
 # Batches up to this size are looked at whole: there is nothing to save.
 _SMALL = 64
+# Up to this size compiling takes longer than whatever is audited.
+_FEW = 256
 
 
 class Audited(ABC):
@@ -72,7 +74,9 @@ def audited(kernel: Any, out: Tree, contacts: Contacts, disturbances: Disturbanc
         return out
     stride = 1 if form == "strict" else setting.STRIDE
     still = jax.lax.stop_gradient((contacts, disturbances, given, out))
-    verdicts, failed = _verdicts(kernel, stride, *still, np.int32(setting.next_turn()))
+    first = jax.tree.leaves(out)[0]
+    few = not isinstance(first, jax.core.Tracer) and first.size <= _FEW
+    verdicts, failed = _VERDICTS[few](kernel, stride, *still, np.int32(setting.next_turn()))
     if not isinstance(failed, jax.core.Tracer):
         if not int(failed):
             return out
@@ -80,7 +84,6 @@ def audited(kernel: Any, out: Tree, contacts: Contacts, disturbances: Disturbanc
     return _corrected(kernel, out, verdicts)
 
 
-@partial(compiled, static_argnums=(0, 1))
 def _verdicts(
     kernel: Any, stride: int, contacts: Contacts, disturbances: DisturbanceSet, given: dict, out: Tree, turn: jax.Array
 ) -> tuple[Tree, jax.Array]:
@@ -98,6 +101,9 @@ def _verdicts(
         verdicts = jax.tree.map(refuted, verdicts, spots, is_leaf=lambda x: hasattr(x, "failed"))
     failed = jnp.sum(jnp.stack([jnp.sum(verdict) for verdict in _flags(verdicts)]))
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), verdicts), failed
+
+
+_VERDICTS = {few: compiled(_verdicts, static_argnums=(0, 1), soon=few) for few in (False, True)}
 
 
 @partial(compiled, static_argnums=(0,))
