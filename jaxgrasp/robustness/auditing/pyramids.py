@@ -210,8 +210,9 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
 
 
 def effort_unit(problem: Problem) -> jax.Array:
-    """The larger limit of every actuator, (lanes, n_u)."""
-    return jnp.maximum(jnp.abs(problem.hand.upper), jnp.abs(problem.hand.lower))
+    """The larger limit of every actuator, (lanes, n_u); a millionth of the largest where it is less, 0 for example."""
+    larger = jnp.maximum(jnp.abs(problem.hand.upper), jnp.abs(problem.hand.lower))
+    return jnp.maximum(larger, 1e-6 * jnp.maximum(larger.max(-1, keepdims=True), 1e-6))
 
 
 def _driven(problem: Problem, forces: jax.Array, efforts: jax.Array) -> jax.Array:
