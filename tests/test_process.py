@@ -89,7 +89,12 @@ def test_the_second_signal_does_not_wait(grasps):
 
 
 def test_a_background_job_passes_ctrl_c_over(grasps):
-    process = begun("--help", preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
+    # A child begins with what its parent ignores.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        process = begun("--help")
+    finally:
+        signal.signal(signal.SIGINT, before)
     process.send_signal(signal.SIGINT)
     printed, _ = process.communicate(timeout=60)
     assert process.returncode == 0 and "usage" in printed
