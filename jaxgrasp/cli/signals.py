@@ -75,13 +75,15 @@ def handled() -> Iterator[None]:
     before = signal.set_wakeup_fd(outbox, warn_on_full_buffer=False)
     # Who starts a command in the background has it pass Ctrl-C over.
     heard = [number for number in _NUMBERS if signal.getsignal(number) is not signal.SIG_IGN]
-    handlers = {number: signal.signal(number, lambda *_: None) for number in heard}
+    handlers = {number: signal.signal(number, _pass_on) for number in heard}
     threading.Thread(target=_watch.listen, args=(inbox,), daemon=True, name="signals").start()
     try:
         yield
     finally:
         for number, handler in handlers.items():
-            signal.signal(number, handler or signal.SIG_DFL)
+            # Not where `end` has come in between.
+            if signal.getsignal(number) is _pass_on:
+                signal.signal(number, handler or signal.SIG_DFL)
         signal.set_wakeup_fd(before)
         os.close(outbox)
         _watch = None
@@ -136,6 +138,10 @@ def end(code: object) -> None:
             with contextlib.suppress(OSError):
                 stream.flush()
         os._exit(code if isinstance(code, int) else 1)
+
+
+def _pass_on(*_: object) -> None:
+    """Leaves a signal to the thread, which has its number by the pipe."""
 
 
 def _ask_writer(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""Starts a command, and answers with an exit code. Nothing that takes long to import is imported before signals are."""
+"""Starts a command, and answers with an exit code; what takes long to import is imported once signals are handled."""
 
 import sys
 from collections.abc import Sequence
@@ -7,18 +7,10 @@ from jaxgrasp.cli import signals
 from jaxgrasp.cli.streams import one_line, prepared, printing
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command `jaxgrasp`. While it runs, Ctrl-C and SIGTERM are its own, see `signals`.
-
-    Args:
-        arguments: What follows the program's name; the process's own where None.
-
-    Returns:
-        The exit code: 0, 2 for what the caller can mend (one line on standard error says what), 130 after Ctrl-C and
-        143 after SIGTERM, 1 where the computation itself failed.
-    """
+def run(arguments: Sequence[str] | None) -> int:
+    """Runs a command, see `jaxgrasp.cli.main`."""
     with signals.handled(), prepared():
-        code = _run(arguments)
+        code = _answer(arguments)
         number = signals.received()
         if number is None:
             return code
@@ -27,18 +19,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 128 + number
 
 
-def program() -> None:
-    """Runs `main` as a process of its own."""
+def run_process() -> None:
+    """Runs a command as a process of its own."""
     with signals.handled():
         try:
-            code = main()
+            code = run(None)
         except SystemExit as leaving:
             code = leaving.code
         signals.end(code)
     sys.exit(code)
 
 
-def _run(arguments: Sequence[str] | None) -> int:
+def _answer(arguments: Sequence[str] | None) -> int:
     from jaxgrasp.cli.problems import CommandError
     from jaxgrasp.cli.subcommands import parsed
     from jaxgrasp.storage import limited_to
