@@ -1,15 +1,18 @@
 """Ctrl-C and SIGTERM at random moments of every command: exit 130 or 143, one line, never a signal.
 
 Every command is started anew in a folder of its own; half of the signals come within the first second. What was written
-has to be whole. A command that was done before its signal came does not count. Before Python has reached the command's
-first line a signal ends it as it ends any Python program: moments are drawn from 0.1 s on, which busy machines exceed.
+has to be whole. A command that was done before its signal came does not count.
 
-    python -m benchmarks.assaults.interrupted [--count 20] [--output interrupted.md]
+Before Python has reached the command's first line a signal ends it as it ends any Python program. How long that takes
+is what signals at random moments of the start tell; those of the other tables come from 0.1 s on.
+
+    python -m benchmarks.assaults.interrupted [--count 20] [--starts 200] [--output interrupted.md]
 """
 
 from __future__ import annotations
 
 import argparse
+import collections
 import os
 import random
 import signal
@@ -19,7 +22,7 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
+from benchmarks.assaults.commands import PROGRAM, empty, made, write_grasps
 
 COMMANDS = {
     "rank": ["rank", "grasps.npz", "--figure", "ranking.png"],
@@ -29,11 +32,30 @@ COMMANDS = {
     "synthesize --scene": ["synthesize", "--scene", "four_fingers", "--starts", "16", "--picture", "None"],
     "compare": ["compare", "grasps.npz", "--friction", "0.6", "--max-force", "5"],
 }
-FIRST = 0.1
+FIRST, START = 0.1, 0.15
+# Who ends the process, from the first moment on.
+PHASES = ("the signal, silently", "Python, with a traceback", "the command, with its line", "the end came before")
+STARTED = {"as a script": PROGRAM, "`python -m jaxgrasp.cli`": [sys.executable, "-m", "jaxgrasp.cli"]}
+
+
+def signalled(command: list[str], number: int, moment: float, home: Path) -> tuple[int, str]:
+    """Exit code of a command that gets a signal at a moment, and what it printed."""
+    process = subprocess.Popen(command, cwd=home, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    try:
+        process.wait(moment)
+    except subprocess.TimeoutExpired:
+        process.send_signal(number)
+    try:
+        complaint = process.communicate(timeout=120)[1]
+    finally:
+        process.kill()
+    return process.returncode, complaint.decode("utf-8", "replace")
 
 
 def whole(path: Path) -> bool:
     if path.suffix == ".npz":
+        import numpy as np
+
         with np.load(path) as archive:
             return all(np.isfinite(archive[name].shape[:1]).all() for name in archive.files)
     if path.suffix == ".parquet":
@@ -45,88 +67,98 @@ def whole(path: Path) -> bool:
 
 
 def once(arguments: list[str], number: int, moment: float, home: Path) -> tuple[str, str]:
-    """The outcome of one input in a word, and what the command printed."""
-    for path in home.iterdir():
-        if path.name != "grasps.npz":
-            path.unlink()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "jaxgrasp.cli", *arguments], cwd=home, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    )
+    """The outcome of one signal in a word, and what the command printed."""
+    empty(home)
     try:
-        process.wait(moment)
+        code, complaint = signalled([*PROGRAM, *arguments], number, moment, home)
     except subprocess.TimeoutExpired:
-        process.send_signal(number)
-    else:
-        return "done before", ""
-    try:
-        complaint = process.communicate(timeout=120)[1].decode("utf-8", "replace")
-    except subprocess.TimeoutExpired:
-        process.kill()
         return "hangs", ""
-    if process.returncode == 0:
+    if code == 0:
         return "done before", complaint
-    if process.returncode != 128 + number:
-        return f"exit {process.returncode}", complaint
+    if code != 128 + number:
+        return f"exit {code}", complaint
     if complaint.count("\n") != 1 or not complaint.startswith("jaxgrasp: "):
         return "not one line", complaint
-    made = [path for path in home.iterdir() if path.name != "grasps.npz"]
-    if any(path.name.startswith(".") for path in made):
+    if any(path.name.startswith(".") for path in made(home)):
         return "litter", complaint
-    if not all(whole(path) for path in made):
+    if not all(whole(path) for path in made(home)):
         return "broken file", complaint
-    return ("kept" if made else "ended"), complaint
+    return ("kept" if made(home) else "ended"), complaint
+
+
+def row(name: str, number: int, count: int, within: float, home: Path, draw: random.Random) -> str:
+    outcomes: collections.Counter[str] = collections.Counter()
+    for turn in range(count):
+        last = 1.0 if turn % 2 else max(1.0, 0.95 * within)
+        what, said = once(COMMANDS[name], number, draw.uniform(FIRST, last), home)
+        outcomes[what] += 1
+        if what not in ("ended", "kept", "done before"):
+            print(name, what, said, file=sys.stderr, flush=True)
+    ended, kept = outcomes.pop("ended", 0), outcomes.pop("kept", 0)
+    rest = ", ".join(f"{count} {what}" for what, count in outcomes.items()) or "none"
+    title = f"`{name}`, {signal.Signals(number).name}"
+    return f"| {title} | {within:.1f} | {count} | {ended} | {kept} | {rest} |"
+
+
+def length(name: str, home: Path) -> float:
+    """How long a command takes whose kernels and programs are on disk, s."""
+    for _ in range(2):
+        empty(home)
+        begun = time.perf_counter()
+        subprocess.run([*PROGRAM, *COMMANDS[name]], cwd=home, check=True, capture_output=True)
+    return time.perf_counter() - begun
+
+
+def start(way: str, number: int, count: int, home: Path, draw: random.Random) -> str:
+    """Who answers signals at random moments of a command's start, and the latest moment of each, ms."""
+    moments: dict[str, list[float]] = {phase: [] for phase in PHASES}
+    for _ in range(count):
+        moment = draw.uniform(0.0, START)
+        code, said = signalled([*STARTED[way], "rank"], number, moment, home)
+        if code == -number and not said:
+            phase = PHASES[0]
+        elif code == 128 + number and said.count("\n") == 1:
+            phase = PHASES[2]
+        else:
+            phase = PHASES[1] if "Traceback" in said or "Fatal" in said else PHASES[3]
+        moments[phase].append(1e3 * moment)
+    cells = [f"{len(found)} (to {max(found):.0f} ms)" if found else "0" for found in moments.values()]
+    return f"| {way}, {signal.Signals(number).name} | {count} | {' | '.join(cells)} |"
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--count", type=int, default=20)
+    options.add_argument("--starts", type=int, default=200)
     options.add_argument("--command", action="append", choices=COMMANDS)
     options.add_argument("--within", type=float, help="latest moment of a signal, s; None for all that a command takes")
     options.add_argument("--output", type=Path)
     given = options.parse_args()
-    draw = random.Random(0)
-    lines = [
-        "| command | within, s | signals | ended at once | work kept | otherwise |",
-        "|---|---:|---:|---:|---:|---|",
-    ]
+    # Who runs this in the background ignores SIGINT, and so would the commands.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    draw, lines = random.Random(0), []
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+        lines.append(line)
+
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
-        from jaxgrasp.candidates import sample_grasps
-
-        grasps = sample_grasps(100_000)
-        np.savez(
-            home / "grasps.npz",
-            positions=grasps.positions,
-            outward_normals=grasps.normals,
-            friction=grasps.friction,
-            max_force=grasps.max_force,
-        )
+        write_grasps(home, 100_000)
+        say("| command | within, s | signals | ended at once | work kept | otherwise |")
+        say("|---|---:|---:|---:|---:|---|")
         for name in given.command or COMMANDS:
-            arguments = COMMANDS[name]
-            begun = time.perf_counter()
-            for _ in range(0 if given.within else 2):
-                begun = time.perf_counter()
-                subprocess.run(
-                    [sys.executable, "-m", "jaxgrasp.cli", *arguments], cwd=home, check=True, capture_output=True
-                )
-            length = given.within or time.perf_counter() - begun
+            within = given.within or length(name, home)
             for number in (signal.SIGINT, signal.SIGTERM):
-                count = given.count if number == signal.SIGINT else max(1, given.count // 4)
-                outcomes: dict[str, int] = {}
-                for turn in range(count):
-                    last = 1.0 if turn % 2 else max(1.0, 0.95 * length)
-                    what, said = once(arguments, number, draw.uniform(FIRST, last), home)
-                    outcomes[what] = outcomes.get(what, 0) + 1
-                    if what not in ("ended", "kept", "done before"):
-                        print(name, what, said, file=sys.stderr, flush=True)
-                ended, kept = outcomes.pop("ended", 0), outcomes.pop("kept", 0)
-                rest = ", ".join(f"{count} {what}" for what, count in outcomes.items()) or "none"
-                title = f"`{name}`, {signal.Signals(number).name}"
-                lines.append(f"| {title} | {length:.1f} | {count} | {ended} | {kept} | {rest} |")
-                print(lines[-1], flush=True)
-    text = "\n".join(lines) + "\n"
+                say(row(name, number, given.count, within, home, draw))
+        say(f"\nWho answers in the first {START:g} s:\n")
+        say(f"| started | signals | {' | '.join(PHASES)} |")
+        say("|---|---:|" + "---:|" * len(PHASES))
+        for way in STARTED:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                say(start(way, number, given.starts, home, draw))
     if given.output:
-        given.output.write_text(f"{text}\n{os.cpu_count()} cores.\n")
+        given.output.write_text("\n".join(lines) + f"\n\n{os.cpu_count()} cores.\n")
 
 
 if __name__ == "__main__":
