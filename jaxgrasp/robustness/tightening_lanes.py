@@ -86,7 +86,7 @@ def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, It
     # The solver's own bound tells how far it came, the other one whether its rows were the right ones.
     came = jnp.where(jnp.isinf(low), 1, size)
     apart = lambda upper, unit: jnp.abs(upper - low) <= accepted * unit  # noqa: E731
-    closed = exact & apart(outcome.record.upper, came) & apart(high, jnp.maximum(came, program.mean / program.scale))
+    closed = exact & apart(outcome.record.upper, came) & apart(high, _told(program.mean / program.scale, came))
     # Where bounds cross, rounding made one of them false: less is attained in any case, and more is certain.
     low, high = jnp.minimum(low, high), jnp.maximum(low, high)
     record = outcome.record._replace(lower=low, upper=high, x=tuple(jnp.where(idle, 0, x) for x in point.x))
@@ -144,6 +144,15 @@ def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, It
         **actuated,
     )
     return solution, record, outcome.iterate
+
+
+def _told(strength: jax.Array, size: jax.Array) -> jax.Array:
+    """What the accepted gap of proven bounds is a share of: the mean largest force, or the size of the margin.
+
+    float32 proves bounds less closely than it finds margins, so there the smaller one counts, for disturbances of a
+    newton; of far weaker ones the margin is so large that nothing but its size can count.
+    """
+    return jnp.maximum(strength, size) if strength.dtype == jnp.float64 else jnp.maximum(0.8 * strength, size / 8)
 
 
 def _unloaded(grasps: Grasps, program: Program) -> jax.Array:
@@ -211,6 +220,9 @@ def solve_effort(grasps: Grasps, program: Program, first: Solution, record: Reco
     attained = largest.attained(best.x)
     missed = problem.violations(best.x, jnp.zeros_like(wanted))
     closed = point.exact & (missed <= _ACCEPTED_MISS[dtype.name]) & (jnp.abs(gap) <= accepted)
+    # The upper bound is part of the answer.
+    told = accepted * _told(program.mean, jnp.maximum(program.scale, jnp.abs(first.margin)))
+    closed &= (first.upper_bound - first.margin <= told) | program.undisturbed
     # A row that lambda hardly moves turns the little that it is missed by into much of lambda.
     attained = jnp.where(closed, jnp.maximum(attained, wanted), attained)
 
