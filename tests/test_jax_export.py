@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from jax import export
-from jax_sample import at, grasps
+from jax_sample import PUSHES, at, grasps
 
 import jaxgrasp as jg
 
@@ -18,18 +18,31 @@ def test_kernels_are_not_exported_and_the_error_says_how_else():
     assert "\n" not in str(error.value)
 
 
-def test_any_number_of_grasps():
+FUNCTIONS = {
+    "margin": lambda c: jg.largest_disturbance(c, PUSHES, cone_edges=4).margin,
+    "effort": lambda c: jg.least_effort(c, PUSHES, 0.01, cone_edges=4).effort,
+    "chain": lambda c: jg.formulation_margin(c, PUSHES, "12_fixed", cone_edges=4).margin,
+    "total effort": lambda c: jg.least_total_effort(c, PUSHES, 0.01, cone_edges=4).effort,
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["margin", *(pytest.param(name, marks=pytest.mark.thorough) for name in FUNCTIONS if name != "margin")]
+)
+def test_any_number_of_grasps(name):
     normals = grasps(5).frames[..., 2]
 
-    def margins(normals):
+    def values(normals):
         contacts = jg.Contacts.from_normals(0.05 * normals, normals, friction=0.5, max_force=1.0)
-        return jg.largest_disturbance(contacts, jg.DisturbanceSet.forces(1.0), cone_edges=4).margin
+        return FUNCTIONS[name](contacts)
 
     (count,) = export.symbolic_shape("b")
     with jg.without_kernels():
-        made = export.export(jax.jit(margins))(jax.ShapeDtypeStruct((count, 4, 3), normals.dtype))
-    np.testing.assert_allclose(made.call(normals), margins(normals), rtol=1e-7)
-    np.testing.assert_allclose(made.call(normals[:2]), margins(normals)[:2], rtol=1e-7)
+        made = export.export(jax.jit(values))(jax.ShapeDtypeStruct((count, 4, 3), normals.dtype))
+    found = values(normals)
+    assert np.isfinite(found).any()
+    np.testing.assert_allclose(made.call(normals), found, rtol=1e-7)
+    np.testing.assert_allclose(made.call(normals[:2]), found[:2], rtol=1e-7)
 
 
 def test_a_program_for_another_platform_has_no_kernel_of_this_one():

@@ -165,6 +165,9 @@ def _chunk(row: jax.Array, lanes: tuple[int, ...]) -> int:
     done inside a tile, where it counts more than one flop a byte and 2e5 of flops + 10 bytes.
     """
     size, width = row.size, row.dtype.itemsize
+    if not isinstance(size, int):
+        # Tiles have a known size.
+        return 16
     for chunk in (16, 8, 4, 2):
         flops = 12 * chunk * size
         moved = (8 * size + 6 * chunk * math.prod(lanes)) * width

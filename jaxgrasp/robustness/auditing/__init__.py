@@ -94,7 +94,8 @@ def _verdicts(
     lanes = jax.tree.leaves(flat)[0].shape[0]
     verdicts = kernel.judge(arguments, flat, stride == 1)
     if stride > 1:
-        step = stride if lanes > _SMALL else 1
+        # Where it is known only when an exported program runs how many there are, all are looked at.
+        step = stride if isinstance(lanes, int) and lanes > _SMALL else 1
         some = jax.tree.map(lambda x: every(x, turn % step, step), flat)
         spots = kernel.spot(picked(arguments, turn % step, step), some)
         refuted = partial(_refuted, turn=turn % step, step=step)
