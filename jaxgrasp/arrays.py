@@ -5,6 +5,7 @@ Shapes are written batch first: `*batch` is any number of leading axes. Inside k
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgrasp import process
+from jaxgrasp.compiling import compiled
 
 
 def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | str, ...]) -> jax.Array:
@@ -27,7 +29,7 @@ def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | s
     """
     process.check()
     try:
-        array = jnp.asarray(value)
+        array = placed(value)
     except TypeError:
         raise ValueError(f"{name}: got {type(value).__name__}, wanted an array of real numbers") from None
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == object:
@@ -39,6 +41,13 @@ def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | s
         wanted = ", ".join(["*batch", *map(str, event)])
         raise ValueError(f"{name}: got shape {array.shape}, wanted ({wanted})")
     return array
+
+
+def placed(value: ArrayLike | Sequence[float]) -> jax.Array:
+    """`jnp.asarray`, which compiles a program for every shape of a NumPy array, where nothing need be compiled."""
+    if type(value) is np.ndarray and jax.sharding.get_abstract_mesh().empty:
+        return jax.device_put(value)
+    return jnp.asarray(value)
 
 
 def literal(values: np.ndarray, dtype: jnp.dtype) -> jax.Array:
@@ -81,7 +90,7 @@ def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
 
 
-@jax.jit
+@partial(compiled, pace=lambda: "soon")
 def frames_from_normals(normals: jax.Array) -> jax.Array:
     """Contact frames (t1, t2, n) of unit normals: the x and y axes turned by the smallest rotation that takes z to n.
 

@@ -10,11 +10,15 @@ import jax.numpy as jnp
 
 from jaxgrasp import process
 
-# Loops over lanes are vectors already as XLA writes them: LLVM's costlier passes take long and gain nothing, while the
-# widest registers, which LLVM is shy of, do. Both options are internals of XLA.
-_OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
-# A third of the time to compile, six times as long to run: for what has little to run.
-_SOON = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+# Internals of XLA. Loops over lanes are vectors already as XLA writes them: LLVM's costlier passes take long and gain
+# nothing, while the widest registers, which LLVM is shy of, do.
+_FAST = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
+# The older of XLA's two ways to loops: programs are ready in a third of the time and keep a tenth of the memory, which
+# counts where every shape has one. What XLA computes for long is up to half slower so.
+_BRIEF = _FAST | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+# Ready in half of that time again, and several times slower: for a few lanes.
+_SOON = _BRIEF | {"xla_backend_optimization_level": 0}
+_PACES = {"fast": (_FAST,), "brief": (_BRIEF, _FAST), "soon": (_SOON, _FAST)}
 
 
 @contextlib.contextmanager
@@ -25,22 +29,22 @@ def own_settings() -> Iterator[None]:
 
 
 def compiled(
-    function: Callable[..., Any], static_argnums: tuple[int, ...] = (), soon: bool = False
+    function: Callable[..., Any], static_argnums: tuple[int, ...] = (), pace: Callable[[], str] = lambda: "fast"
 ) -> Callable[..., Any]:
     """`jax.jit` with the options that suit this library's kernels, where it is the outermost one.
 
     JAX takes options for whole programs only: inside somebody's transformation theirs apply.
 
     Args:
-        function: what to compile.
-        static_argnums: as for `jax.jit`.
-        soon: compile fast rather than well.
+        function: to be compiled.
+        static_argnums: as `jax.jit` takes them.
+        pace: what the next call should be compiled for, see `options`.
     """
     inner = jax.jit(function, static_argnums=static_argnums)
 
     @functools.cache
-    def outer() -> Callable[..., Any]:
-        return jax.jit(function, static_argnums=static_argnums, compiler_options=options(soon))
+    def outer(pace: str) -> Callable[..., Any]:
+        return jax.jit(function, static_argnums=static_argnums, compiler_options=options(pace))
 
     @functools.wraps(function)
     def call(*args: Any) -> Any:
@@ -52,19 +56,24 @@ def compiled(
                 return inner(*args)
             # NaN and infinity are answers here.
             with jax.debug_nans(False), jax.debug_infs(False):
-                return outer()(*args)
+                return outer(pace())(*args)
 
     return call
 
 
 @functools.cache
-def options(soon: bool = False) -> dict[str, Any] | None:
-    """`compiler_options` for `jax.jit`; None on other than CPUs, and where XLA no longer knows them."""
-    wanted = _SOON if soon else _OPTIONS
+def options(pace: str = "fast") -> dict[str, Any] | None:
+    """`compiler_options` for `jax.jit`; None on other than CPUs, and where XLA no longer knows them.
+
+    Args:
+        pace: "fast" runs fast; "brief" is for programs in which XLA computes little, "soon" for those of a few lanes.
+    """
     if jax.default_backend() != "cpu":
         return None
-    try:
-        jax.jit(lambda x: x, compiler_options=wanted).lower(0.0).compile()
-    except jax.errors.JaxRuntimeError:
-        return None
-    return wanted
+    for known in _PACES[pace]:
+        try:
+            jax.jit(lambda x: x, compiler_options=known).lower(0.0).compile()
+        except jax.errors.JaxRuntimeError:
+            continue
+        return known
+    return None

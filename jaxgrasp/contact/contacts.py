@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals
+from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals, placed
+from jaxgrasp.compiling import compiled
 from jaxgrasp.records import record
 
 
@@ -57,7 +58,7 @@ class Contacts:
         frames = as_float("frames", frames, ("n_c", 3, 3))
         friction = as_float("friction", friction, ())
         max_force = as_float("max_force", max_force, ())
-        present = jnp.asarray(True if active is None else active)
+        present = placed(True if active is None else active)
         if present.dtype != bool:
             raise ValueError(f"active: got dtype {present.dtype}, wanted bool")
         n_c = positions.shape[-2]
@@ -139,7 +140,7 @@ class Contacts:
 _EVENTS = {"positions": (3,), "frames": (3, 3), "friction": (), "max_force": (), "active": ()}
 
 
-@functools.partial(jax.jit, static_argnums=(0,))
+@functools.partial(compiled, static_argnums=(0,), pace=lambda: "soon")
 def _spread(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.Array]:
     """The leaves in one precision and with all axes: one program, where each operation would be one by itself."""
     positions, frames = leaves[:2]

@@ -17,6 +17,7 @@ from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
+from jaxgrasp.kernels import usable
 from jaxgrasp.robustness.arguments import Arguments, laid_out
 from jaxgrasp.robustness.auditing import audited
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
@@ -125,7 +126,7 @@ def over_grasps(
     return audited(kernel, _run(kernel, contacts, disturbances, given), contacts, disturbances, given)
 
 
-@functools.partial(compiled, static_argnums=(0,))
+@functools.partial(compiled, static_argnums=(0,), pace=lambda: "brief" if usable() else "fast")
 def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Any:
     """Run the kernel over the lanes."""
     arguments = laid_out(contacts, disturbances, given)

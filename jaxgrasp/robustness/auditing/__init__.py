@@ -75,8 +75,8 @@ def audited(kernel: Any, out: Tree, contacts: Contacts, disturbances: Disturbanc
     stride = 1 if form == "strict" else setting.STRIDE
     still = jax.lax.stop_gradient((contacts, disturbances, given, out))
     first = jax.tree.leaves(out)[0]
-    few = not isinstance(first, jax.core.Tracer) and first.size <= _FEW
-    verdicts, failed = _VERDICTS[few](kernel, stride, *still, np.int32(setting.next_turn()))
+    pace = "brief" if isinstance(first, jax.core.Tracer) or first.size > _FEW else "soon"
+    verdicts, failed = _JUDGES[pace](kernel, stride, *still, np.int32(setting.next_turn()))
     if not isinstance(failed, jax.core.Tracer):
         if not int(failed):
             return out
@@ -104,10 +104,10 @@ def _verdicts(
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), verdicts), failed
 
 
-_VERDICTS = {few: compiled(_verdicts, static_argnums=(0, 1), soon=few) for few in (False, True)}
+_JUDGES = {pace: compiled(_verdicts, static_argnums=(0, 1), pace=lambda pace=pace: pace) for pace in ("brief", "soon")}
 
 
-@partial(compiled, static_argnums=(0,))
+@partial(compiled, static_argnums=(0,), pace=lambda: "soon")
 def _corrected(kernel: Any, out: Tree, verdicts: Tree) -> Tree:
     return kernel.correct(out, verdicts)
 
