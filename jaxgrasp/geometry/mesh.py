@@ -1,7 +1,6 @@
 """Triangle meshes from files, and the grids of their signed distances."""
 
-import io
-import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,16 +8,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxgrasp.geometry.grid import DistanceGrid
+from jaxgrasp.geometry.mesh_files import COSTS, TRIANGLE, read_triangles
 from jaxgrasp.geometry.triangles import signed_distances
-from jaxgrasp.storage import FileError, open_regular, printable
+from jaxgrasp.storage import FileError, allowance, open_regular, printable, reason_of
 
 MESH_ENDINGS = (".stl", ".obj", ".ply")
 # Nodes beyond the mesh on every side: the spline's support, and room for points on their way back to the surface.
 _MARGIN = 4
 # Nodes nearer to the surface than 1.5 sqrt(3) spacings take part in look-ups on it; the rest is for those beside it.
 _BAND = 3.5
-# Bytes of memory that a byte of a mesh file takes, of text above all.
-_COST = 10
 
 
 class MeshError(ValueError):
@@ -78,25 +76,16 @@ class Mesh:
         path = Path(path)
         if path.suffix.lower() not in MESH_ENDINGS:
             raise MeshError(f"{path}: got the ending {path.suffix!r}, wanted one of {', '.join(MESH_ENDINGS)}")
-        # Two seconds that those who need no files do not wait for.
-        import trimesh
-
         kind = path.suffix[1:].lower()
         try:
-            with open_regular(path, "an intact mesh", cost=_COST) as stream:
-                content = stream.read()
-            if kind == "ply":
-                _check_counts(content)
-            # Without a name there are no neighbours, of which the file could make us read others.
-            found = trimesh.load_mesh(io.BytesIO(content), file_type=kind, process=True, skip_materials=True)
-            vertices, faces = scale * np.asarray(found.vertices), np.asarray(found.faces)
+            with open_regular(path, "an intact mesh", cost=COSTS[kind]) as stream:
+                vertices, faces = read_triangles(stream.read(), kind, allowance() // TRIANGLE)
         except FileError as error:
             raise MeshError(str(error)) from error
-        except Exception as error:
-            # For damaged files trimesh raises whatever its parsers run into.
-            raise MeshError(f"{path}: got damaged data ({type(error).__name__}), wanted an intact mesh") from error
+        except (ValueError, LookupError, OverflowError, struct.error, Warning) as error:
+            raise MeshError(f"{path}: got damaged data ({reason_of(error)}), wanted an intact mesh") from error
         try:
-            return cls.from_arrays(vertices, faces)
+            return cls.from_arrays(scale * vertices, faces)
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
 
@@ -170,13 +159,6 @@ class Mesh:
         corners = self.triangles - amid
         volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
         return volumes, corners.sum(1) / 4 + amid
-
-
-def _check_counts(content: bytes) -> None:
-    """Refuses a PLY file that declares more elements than it has bytes, before they are allocated."""
-    declared = re.findall(rb"^element\s+\S+\s+(\d+)", content.split(b"end_header", 1)[0], re.MULTILINE)
-    if sum(int(count[:20]) for count in declared) > len(content):
-        raise ValueError("more elements than bytes")
 
 
 def _spacing(extents: np.ndarray, nodes: int) -> float:
