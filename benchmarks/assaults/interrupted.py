@@ -1,12 +1,10 @@
 """Ctrl-C and SIGTERM at random moments of every command: exit 130 or 143, one line, never a signal.
 
 Every command is started anew in a folder of its own; half of the signals come within the first second. What was written
-has to be whole. A command that was done before its signal came does not count.
+has to be whole. Before Python runs the first line of the script that pip installs, no program can answer a signal: such
+signals are counted apart, as are commands that were done before.
 
-Before Python has reached the command's first line a signal ends it as it ends any Python program. How long that takes
-is what signals at random moments of the start tell; those of the other tables come from 0.1 s on.
-
-    python -m benchmarks.assaults.interrupted [--count 20] [--starts 200] [--output interrupted.md]
+    python -m benchmarks.assaults.interrupted [--count 20] [--output interrupted.md]
 """
 
 from __future__ import annotations
@@ -32,24 +30,25 @@ COMMANDS = {
     "synthesize --scene": ["synthesize", "--scene", "four_fingers", "--starts", "16", "--picture", "None"],
     "compare": ["compare", "grasps.npz", "--friction", "0.6", "--max-force", "5"],
 }
-FIRST, START = 0.1, 0.15
-# Who ends the process, from the first moment on.
-PHASES = ("the signal, silently", "Python, with a traceback", "the command, with its line", "the end came before")
-STARTED = {"as a script": PROGRAM, "`python -m jaxgrasp.cli`": [sys.executable, "-m", "jaxgrasp.cli"]}
 
 
-def signalled(command: list[str], number: int, moment: float, home: Path) -> tuple[int, str]:
-    """Exit code of a command that gets a signal at a moment, and what it printed."""
-    process = subprocess.Popen(command, cwd=home, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+def signalled(arguments: list[str], number: int, moment: float, home: Path) -> tuple[int, str, bool]:
+    """Exit code of a command that gets a signal at a moment, what it printed, and whether its script had begun."""
+    begun, begins = os.pipe()
+    script = [*PROGRAM[:-1], f"import os\nos.write({begins}, b'.')\nos.close({begins})\n{PROGRAM[-1]}"]
+    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "pass_fds": (begins,)}
+    process = subprocess.Popen([*script, *arguments], cwd=home, **streams)
+    os.close(begins)
     try:
         process.wait(moment)
     except subprocess.TimeoutExpired:
         process.send_signal(number)
     try:
         complaint = process.communicate(timeout=120)[1]
+        return process.returncode, complaint.decode("utf-8", "replace"), bool(os.read(begun, 1))
     finally:
         process.kill()
-    return process.returncode, complaint.decode("utf-8", "replace")
+        os.close(begun)
 
 
 def whole(path: Path) -> bool:
@@ -70,9 +69,11 @@ def once(arguments: list[str], number: int, moment: float, home: Path) -> tuple[
     """The outcome of one signal in a word, and what the command printed."""
     empty(home)
     try:
-        code, complaint = signalled([*PROGRAM, *arguments], number, moment, home)
+        code, complaint, begun = signalled(arguments, number, moment, home)
     except subprocess.TimeoutExpired:
         return "hangs", ""
+    if not begun:
+        return "before", complaint
     if code == 0:
         return "done before", complaint
     if code != 128 + number:
@@ -90,14 +91,14 @@ def row(name: str, number: int, count: int, within: float, home: Path, draw: ran
     outcomes: collections.Counter[str] = collections.Counter()
     for turn in range(count):
         last = 1.0 if turn % 2 else max(1.0, 0.95 * within)
-        what, said = once(COMMANDS[name], number, draw.uniform(FIRST, last), home)
+        what, said = once(COMMANDS[name], number, draw.uniform(0.0, last), home)
         outcomes[what] += 1
-        if what not in ("ended", "kept", "done before"):
+        if what not in ("ended", "kept", "before", "done before"):
             print(name, what, said, file=sys.stderr, flush=True)
-    ended, kept = outcomes.pop("ended", 0), outcomes.pop("kept", 0)
+    before, ended, kept = (outcomes.pop(what, 0) for what in ("before", "ended", "kept"))
     rest = ", ".join(f"{count} {what}" for what, count in outcomes.items()) or "none"
     title = f"`{name}`, {signal.Signals(number).name}"
-    return f"| {title} | {within:.1f} | {count} | {ended} | {kept} | {rest} |"
+    return f"| {title} | {within:.1f} | {count} | {before} | {ended} | {kept} | {rest} |"
 
 
 def length(name: str, home: Path) -> float:
@@ -109,27 +110,9 @@ def length(name: str, home: Path) -> float:
     return time.perf_counter() - begun
 
 
-def start(way: str, number: int, count: int, home: Path, draw: random.Random) -> str:
-    """Who answers signals at random moments of a command's start, and the latest moment of each, ms."""
-    moments: dict[str, list[float]] = {phase: [] for phase in PHASES}
-    for _ in range(count):
-        moment = draw.uniform(0.0, START)
-        code, said = signalled([*STARTED[way], "rank"], number, moment, home)
-        if code == -number and not said:
-            phase = PHASES[0]
-        elif code == 128 + number and said.count("\n") == 1:
-            phase = PHASES[2]
-        else:
-            phase = PHASES[1] if "Traceback" in said or "Fatal" in said else PHASES[3]
-        moments[phase].append(1e3 * moment)
-    cells = [f"{len(found)} (to {max(found):.0f} ms)" if found else "0" for found in moments.values()]
-    return f"| {way}, {signal.Signals(number).name} | {count} | {' | '.join(cells)} |"
-
-
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--count", type=int, default=20)
-    options.add_argument("--starts", type=int, default=200)
     options.add_argument("--command", action="append", choices=COMMANDS)
     options.add_argument("--within", type=float, help="latest moment of a signal, s; None for all that a command takes")
     options.add_argument("--output", type=Path)
@@ -145,18 +128,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
         write_grasps(home, 100_000)
-        say("| command | within, s | signals | ended at once | work kept | otherwise |")
-        say("|---|---:|---:|---:|---:|---|")
+        say("| command | within, s | signals | before its first line | ended at once | work kept | otherwise |")
+        say("|---|---:|---:|---:|---:|---:|---|")
         for name in given.command or COMMANDS:
             within = given.within or length(name, home)
             for number in (signal.SIGINT, signal.SIGTERM):
                 say(row(name, number, given.count, within, home, draw))
-        say(f"\nWho answers in the first {START:g} s:\n")
-        say(f"| started | signals | {' | '.join(PHASES)} |")
-        say("|---|---:|" + "---:|" * len(PHASES))
-        for way in STARTED:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                say(start(way, number, given.starts, home, draw))
     if given.output:
         given.output.write_text("\n".join(lines) + f"\n\n{os.cpu_count()} cores.\n")
 
