@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.assaults.damage import damaged
+from benchmarks.assaults.zips import zips
 
 GRASPS, CONTACTS = 6, 4
 
@@ -195,6 +196,21 @@ def archives(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
         ("bomb_below_budget", (6, 30_000_000), "extra"),
     ):
         yield name, bomb(std, shape, field)
+    yield from zips(std)
+    frames = np.broadcast_to(np.eye(3), (GRASPS, CONTACTS, 3, 3))
+    for label, value in {
+        "good": frames,
+        "left_handed": -frames,
+        "long": 2 * frames,
+        "zero": 0 * frames,
+        "nan": np.nan * frames,
+        "skew": frames + 0.1,
+        "flat": frames[..., 0],
+        "fortran": np.asfortranarray(frames),
+        "swapped": frames.astype(">f4"),
+    }.items():
+        yield f"frames_{label}", saved(**{k: v for k, v in good.items() if k != "outward_normals"}, frames=value)
+        yield f"both_{label}", saved(**good, frames=value)
     yield "bomb_header", zipped([*std, ("extra.npy", raw(b" " * 80_000_000, version=(2, 0)))], zipfile.ZIP_DEFLATED)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from typing import Any
 
 from benchmarks.assaults.arrays import archives, arrays
 from benchmarks.assaults.models import models
-from benchmarks.assaults.shapes import obj, ply, stl
+from benchmarks.assaults.shapes import large_obj, large_ply, large_stl, obj, ply, stl
 
 
 @dataclass(frozen=True)
@@ -22,18 +23,27 @@ class Case:
     path: Path
 
 
-def cases(folder: Path, only: str | None = None, seed: int = 0) -> list[Case]:
-    """Writes all of them, or those of one kind, into a folder."""
+MAKERS = {
+    "npz": (archives,),
+    "npy": (arrays,),
+    "stl": (stl, large_stl),
+    "obj": (obj, large_obj),
+    "ply": (ply, large_ply),
+    "xml": (models,),
+}
+
+
+def cases(folder: Path, only: str | None = None, seed: int = 0, large: bool = False) -> list[Case]:
+    """Writes all of them, or those of one kind, into a folder; megabytes that are slow to make only where asked for."""
     found = []
-    for kind, make in (
-        ("npz", archives), ("npy", arrays), ("stl", stl), ("obj", obj), ("ply", ply), ("xml", models)
-    ):  # fmt: skip
+    for kind, makes in MAKERS.items():
         if only not in (None, kind):
             continue
         home = folder / kind
         home.mkdir(parents=True)
         names = os.fspath(home)
-        for name, content in make(random.Random(seed), home):
+        made = (make(random.Random(seed), home) for make in makes[: None if large else 1])
+        for name, content in itertools.chain.from_iterable(made):
             path = Path(names, f"{len(found):04d}_{name}.{kind}")
             if isinstance(content, bytes):
                 path.write_bytes(content)
