@@ -177,3 +177,12 @@ def test_configurations_by_wrong_names_and_shapes(files):
         scene.qpos(object=np.zeros(6))
     with pytest.raises(ValueError, match=r"^qpos: got 2 and 3 configurations"):
         scene.qpos(joints={"a": np.zeros(2), "b": np.zeros(3)})
+
+
+def test_an_object_meets_every_mask_of_the_hand(files, tmp_path):
+    """The tips of some hands collide with nothing that has MuJoCo's own masks."""
+    path = tmp_path / "masked.xml"
+    path.write_text(HAND.replace('name="tip"', 'name="tip" contype="0" conaffinity="4"'))
+    for object in ("sphere", files / "pieces"):
+        hand = Scene.build(hand=path, object=object, scale=0.05).hand_object()
+        assert {hand.model.body(b).name for b in hand.touching_links} == {"palm", "f1", "f2"}

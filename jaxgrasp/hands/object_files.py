@@ -49,7 +49,13 @@ def add_object(
     if isinstance(object, mujoco.MjSpec) or Path(object).suffix.lower() in (".xml", ".mjcf", ".urdf"):
         geoms = _add_bodies(spec, body, object, scale)
     else:
+        masks = 1
+        for geom in spec.geoms:
+            masks |= geom.contype | geom.conaffinity
         geoms = _add_geoms(spec, body, object, scale)
+        for geom in geoms:
+            # It meets whatever collides, whichever masks the hand has for itself.
+            geom.contype = geom.conaffinity = masks
         density = _WATER if mass is None and density is None else density
     if mass is None and density is None:
         return
