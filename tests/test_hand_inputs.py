@@ -179,7 +179,7 @@ def test_no_distance_is_known_of_a_plane_but_mujoco_knows_one():
     assert hand.grasps(model.qpos0).touching == 4
     with pytest.raises(ValueError, match=r"^engine: got 'mujoco' inside jit"):
         jax.jit(lambda q: hand.grasps(q, "mujoco"))(model.qpos0)
-    with pytest.raises(ValueError, match=r"^engine: got 'bullet', wanted one of mujoco, distance"):
+    with pytest.raises(ValueError, match=r"^engine: got 'bullet', wanted one of mujoco, distance, mjx"):
         hand.grasps(model.qpos0, "bullet")
 
 

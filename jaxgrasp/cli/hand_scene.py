@@ -77,7 +77,8 @@ class HandScene:
     """What joint directions do that nothing drives: held bear any torque, free none."""
 
     engine: str | None = None
-    """What finds contacts: mujoco or distance; None takes mujoco on CPUs, distance elsewhere."""
+    """What finds contacts: mujoco, distance, or mjx (what touches or penetrates, with --contact-distance 0); None takes
+    mujoco on CPUs, distance elsewhere."""
 
     picture: Path | None = Path("hands.png")
     """The rendered picture of the best configurations to write, .png; None for none."""

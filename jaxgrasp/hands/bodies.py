@@ -45,6 +45,20 @@ def _refuse_infinite(model: mujoco.MjModel) -> None:
         raise ValueError(f"scene: got {', '.join(bad)} with entries that are not finite; wanted numbers")
 
 
+def check_length(model: mujoco.MjModel, shape: tuple[int, ...]) -> None:
+    """Checks the shape (*batch, nq) of configurations.
+
+    Raises:
+        ValueError: It has another length.
+    """
+    if not shape or shape[-1] != model.nq:
+        free = int(mujoco.mjtJoint.mjJNT_FREE)
+        names = ", ".join(
+            f"{model.joint(j).name or j}{' (7)' if model.jnt_type[j] == free else ''}" for j in range(model.njnt)
+        )
+        raise ValueError(f"qpos: got shape {shape}, wanted (*batch, {model.nq}), positions of joints {names}")
+
+
 def body_named(model: mujoco.MjModel, argument: str, name: str) -> int:
     """The number of a body; `argument` is what named it, for the error.
 

@@ -10,12 +10,16 @@ from jaxgrasp.hands.engines import Geometry
 from jaxgrasp.hands.kinematics import Kinematics, Poses, matrices, place
 from jaxgrasp.hands.link_contacts import RawPoints
 from jaxgrasp.hands.passive import spring_torques
-from jaxgrasp.hands.tendons import spatial_transmission
+from jaxgrasp.hands.tendons import transmission_of
 from jaxgrasp.hands.touching import Points, pair_table, touching_points
 
 
 class DistanceEngine:
     """Finds contacts of a hand and an object by signed distances."""
+
+    tile = 512
+    """Configurations at a time on CPUs."""
+    differentiable = True
 
     def __init__(
         self,
@@ -57,7 +61,7 @@ class DistanceEngine:
     ) -> Geometry:
         """What is where, with points that are known already."""
         axes, anchors = self.of_joints(poses)
-        lengths, moments = self._lengths(qpos)
+        lengths, moments = transmission_of(self._model, self._joints, self._actuators, qpos)
         springs = spring_torques(self._model, self._joints, qpos, jnp)
         return Geometry(points, rotation, centre, anchors, axes, lengths, moments, springs)
 
@@ -87,17 +91,3 @@ class DistanceEngine:
         offsets, turns = self._model.body_ipos[bodies].T, np.repeat(np.eye(3)[..., None], len(bodies), -1)
         centres = place(poses.rotations[:, :, bodies], poses.positions[:, bodies], offsets, turns)[1]
         return jnp.einsum("b,ibn->ni", jnp.asarray(masses / masses.sum(), centres.dtype), centres)
-
-    def _lengths(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array | np.ndarray]:
-        """Lengths (n, actuators) and B, (joints, actuators) where it is the same everywhere."""
-        model, numbers, constant = self._model, self._actuators.numbers, self._actuators.transmission
-        if constant is not None:
-            data = mujoco.MjData(model)
-            mujoco.mj_forward(model, data)
-            places = model.jnt_qposadr[self._joints]
-            start = jnp.asarray(data.actuator_length[numbers], qpos.dtype)
-            rest = jnp.asarray(model.qpos0[places], qpos.dtype)
-            return start + (qpos[:, places] - rest) @ jnp.asarray(constant, qpos.dtype), constant
-        lengths, moments = jax.vmap(spatial_transmission(model))(qpos)
-        moments = moments[:, numbers][:, :, model.jnt_dofadr[self._joints]]
-        return lengths[:, numbers], jnp.swapaxes(moments, -1, -2)

@@ -4,15 +4,16 @@
 |---|---|---|
 | mujoco | C MuJoCo's collision, in a pool of threads; every kind of geom, nothing is compiled | ranking and judging |
 | distance | signed distances, compiled by JAX | derivatives, jit and vmap, accelerators |
+| mjx | MJX's collision, compiled by JAX; of boxes and meshes only where they penetrate | jit and vmap, accelerators |
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 
 from jaxgrasp.hands.link_contacts import RawPoints
 
-ENGINES = ("mujoco", "distance")
+ENGINES = ("mujoco", "distance", "mjx")
 
 
 class Geometry(NamedTuple):
@@ -36,11 +37,23 @@ class Geometry(NamedTuple):
     """(n, dofs), torques of the springs of joints and tendons, N m or N."""
 
 
+class Engine(Protocol):
+    """What finds contacts; made of a scene, the bodies of hand and object, and the joints and actuators of the hand."""
+
+    differentiable: bool
+    """Whether what it finds has derivatives; stops of joints, whose torques jump, then do not count."""
+
+    def find(self, qpos: Any) -> Geometry:
+        """What is where in configurations (n, nq), which are finite."""
+        ...
+
+
 def engine_for(given: str | None, qpos: Any) -> str:
     """The engine that answers.
 
     MuJoCo's cannot be differentiated or compiled, and would wait for an accelerator's data: it is taken where JAX runs
-    on CPUs and `qpos` is no tracer.
+    on CPUs and `qpos` is no tracer. Where it is not, `distance` is, which has derivatives and knows how far geoms are
+    apart; `mjx` has to be asked for.
 
     Args:
         given: What the caller wants; None chooses.
@@ -55,5 +68,5 @@ def engine_for(given: str | None, qpos: Any) -> str:
     if given not in ENGINES:
         raise ValueError(f"engine: got {given!r}, wanted one of {', '.join(ENGINES)}")
     if traced and given == "mujoco":
-        raise ValueError("engine: got 'mujoco' inside jit, vmap or grad, wanted 'distance' there")
+        raise ValueError("engine: got 'mujoco' inside jit, vmap or grad, wanted 'distance' or 'mjx' there")
     return given

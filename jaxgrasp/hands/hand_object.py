@@ -1,8 +1,8 @@
 """A hand and an object from MJCF: from joint angles to contacts and to what the actuators can do."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from os import PathLike
 from types import ModuleType
 
@@ -22,6 +22,7 @@ from jaxgrasp.hands.bodies import (
     admissible_configurations,
     bodies_below,
     body_named,
+    check_length,
     hand_bodies,
     moved_by_joints,
     read_model,
@@ -30,17 +31,17 @@ from jaxgrasp.hands.bodies import (
 from jaxgrasp.hands.contact_parameters import hand_object_pairs
 from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.distance_engine import DistanceEngine
-from jaxgrasp.hands.engines import engine_for
+from jaxgrasp.hands.engines import Engine, engine_for
 from jaxgrasp.hands.grasps import HandGrasps
-from jaxgrasp.hands.kinematics import BALL, FREE, HINGE, SLIDE, Kinematics, Poses
+from jaxgrasp.hands.kinematics import BALL, HINGE, SLIDE, Kinematics, Poses
 from jaxgrasp.hands.link_contacts import ContactRule, RawPoints
 from jaxgrasp.hands.mechanics import Mechanics, point_velocities
+from jaxgrasp.hands.mjx_engine import MjxEngine
 from jaxgrasp.hands.mujoco_engine import MujocoEngine
 from jaxgrasp.hands.passive import read_passive
 from jaxgrasp.hands.touching import Points
 
-# Configurations at a time on CPUs.
-_TILE = 512
+_ENGINES = {"mujoco": MujocoEngine, "distance": DistanceEngine, "mjx": MjxEngine}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,6 +68,8 @@ class HandObject:
     """The bodies of the hand that can touch the object."""
     _actuators: Actuators
     _mechanics: Mechanics
+    _engines: dict[str, Engine] = field(default_factory=dict, init=False)
+    _programs: dict[str, Callable[[jax.Array], HandGrasps]] = field(default_factory=dict, init=False)
 
     @classmethod
     def from_mjcf(
@@ -185,8 +188,8 @@ class HandObject:
 
         Args:
             qpos: (*batch, nq), as MuJoCo lays configurations out: rad, m, and unit quaternions (w, x, y, z).
-            engine: What finds the contacts: "mujoco", or "distance", which is differentiable and compiled by JAX. None
-                chooses, see `engine_for`.
+            engine: What finds the contacts: "mujoco", "distance", which is differentiable and compiled by JAX, or
+                "mjx", compiled, too, for pairs that touch or penetrate. None chooses, see `engine_for`.
 
         Returns:
             The grasps. A configuration that is not finite, or has a quaternion whose norm is not 1 to 0.001, becomes a
@@ -200,27 +203,23 @@ class HandObject:
             features of two geoms change. Stops of joints do not count there: what they bear jumps where they are
             reached.
         """
-        if engine_for(engine, qpos) == "mujoco":
+        name = engine_for(engine, qpos)
+        finder = self.engine(name)
+        if name == "mujoco":
             values = np.asarray(qpos, float)
-            self._check_length(values.shape)
+            check_length(self.model, values.shape)
             batch = values.shape[:-1]
-            flat = self._found(values.reshape(-1, self.nq), np)
+            flat = self._found(finder, values.reshape(-1, self.nq), np)
         else:
             qpos = as_float("qpos", qpos, ())
-            self._check_length(qpos.shape)
-            # What cannot be measured is told before anything is compiled.
-            _ = self._distances
+            check_length(self.model, qpos.shape)
             batch = qpos.shape[:-1]
-            flat = self._compiled(qpos.reshape(-1, self.nq).astype(jnp.result_type(float)))
+            flat = self._program(name)(qpos.reshape(-1, self.nq).astype(jnp.result_type(float)))
         return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), flat)
 
-    def _check_length(self, shape: tuple[int, ...]) -> None:
-        if not shape or shape[-1] != self.nq:
-            model = self.model
-            names = ", ".join(
-                f"{model.joint(j).name or j}{' (7)' if model.jnt_type[j] == FREE else ''}" for j in range(model.njnt)
-            )
-            raise ValueError(f"qpos: got shape {shape}, wanted (*batch, {self.nq}), positions of joints {names}")
+    def stops(self, joints: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Which of `joints` lean on their lower stop, and on their upper one, at positions (*batch, joints)."""
+        return self._mechanics.passive.stops(np.asarray(joints, float))
 
     def actuator_efforts(self, grasps: HandGrasps, efforts: ArrayLike) -> Float[Array, "*batch actuators"]:
         """What the actuators themselves exert: without what joints bear by themselves, and without springs.
@@ -320,25 +319,26 @@ class HandObject:
         """All points where geoms touch or come near, (n, slots, ...)."""
         return self._distances.points(poses)
 
-    @cached_property
-    def _compiled(self):
-        return compiled(self._in_tiles)
+    def _program(self, name: str) -> Callable[[jax.Array], HandGrasps]:
+        if name not in self._programs:
+            self._programs[name] = compiled(partial(self._in_tiles, self.engine(name)))
+        return self._programs[name]
 
-    def _in_tiles(self, qpos: jax.Array) -> HandGrasps:
+    def _in_tiles(self, engine: DistanceEngine | MjxEngine, qpos: jax.Array) -> HandGrasps:
         """On CPUs, tiles that stay in the cache; and searches among their lanes do not wait for the slowest of all."""
-        count = len(qpos)
-        if count <= _TILE or jax.default_backend() != "cpu":
-            return self._found(qpos, jnp)
-        tiles = -(-count // _TILE)
-        padded = jnp.pad(qpos, [(0, tiles * _TILE - count), (0, 0)], mode="edge")
-        found = lax.map(lambda tile: self._found(tile, jnp), padded.reshape(tiles, _TILE, -1))
-        return jax.tree.map(lambda x: x.reshape(tiles * _TILE, *x.shape[2:])[:count], found)
+        count, size = len(qpos), engine.tile
+        if count <= size or jax.default_backend() != "cpu":
+            return self._found(engine, qpos, jnp)
+        tiles = -(-count // size)
+        padded = jnp.pad(qpos, [(0, tiles * size - count), (0, 0)], mode="edge")
+        found = lax.map(lambda tile: self._found(engine, tile, jnp), padded.reshape(tiles, size, -1))
+        return jax.tree.map(lambda x: x.reshape(tiles * size, *x.shape[2:])[:count], found)
 
-    def _found(self, qpos: Array | np.ndarray, xp: ModuleType) -> HandGrasps:
-        """For (n, nq), by engine `mujoco` in NumPy, by `distance` in JAX's arrays."""
+    def _found(self, engine: Engine, qpos: Array | np.ndarray, xp: ModuleType) -> HandGrasps:
+        """For (n, nq), by engine `mujoco` in NumPy, by others in JAX's arrays."""
         admissible = admissible_configurations(self.model, qpos, xp)
         safe = xp.where(admissible[:, None], qpos, self.model.qpos0.astype(qpos.dtype))
-        geometry = self._engine.find(safe) if xp is np else self._distances.find(safe)
+        geometry = engine.find(safe)
         found = self.rule.contacts(geometry.points, self.touching_links, xp)
         rotation, centre = geometry.object_rotation, geometry.object_position
         in_object = lambda x: xp.einsum("nji,ncj->nci", rotation, x)  # noqa: E731
@@ -368,18 +368,19 @@ class HandObject:
             actuator_lengths=as_float_array(geometry.lengths),
             object_position=as_float_array(centre),
             object_rotation=as_float_array(rotation),
-            **self._mechanics.actuation(geometry, joints, jacobian, xp is np, xp),
+            **self._mechanics.actuation(geometry, joints, jacobian, not engine.differentiable, xp),
         )
 
-    @cached_property
-    def _engine(self) -> MujocoEngine:
-        of_object = bodies_below(self.model, self.object_body)
-        return MujocoEngine(self.model, self.bodies, of_object, self.joints, self.actuators, self.contact_distance)
+    def engine(self, name: str) -> Engine:
+        """The engine of a name, made once."""
+        if name not in self._engines:
+            parts = self.bodies, bodies_below(self.model, self.object_body), self.joints, self._actuators
+            self._engines[name] = _ENGINES[name](self.model, *parts, self.contact_distance)
+        return self._engines[name]
 
     @cached_property
     def _distances(self) -> DistanceEngine:
-        of_object = bodies_below(self.model, self.object_body)
-        return DistanceEngine(self.model, self.bodies, of_object, self.joints, self._actuators, self.contact_distance)
+        return self.engine("distance")
 
     @property
     def kinematics(self) -> Kinematics:

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import numpy as np
 
+from jaxgrasp.hands.actuators import Actuators
 from jaxgrasp.hands.contact_parameters import coulomb
 from jaxgrasp.hands.engines import Geometry
 from jaxgrasp.hands.link_contacts import RawPoints
@@ -15,13 +16,15 @@ from jaxgrasp.hands.link_contacts import RawPoints
 class MujocoEngine:
     """Finds contacts of a hand and an object with C MuJoCo."""
 
+    differentiable = False
+
     def __init__(
         self,
         model: mujoco.MjModel,
         hand: np.ndarray,
         object: np.ndarray,
         joints: np.ndarray,
-        actuators: np.ndarray,
+        actuators: Actuators,
         contact_distance: float,
     ):
         """Takes a copy of the scene in which the object's geoms have the contact distance as margin, too.
@@ -36,7 +39,7 @@ class MujocoEngine:
         """
         self._model = model = copy.copy(model)
         self._distance = contact_distance
-        self._object, self._joints, self._actuators = object, joints, actuators
+        self._object, self._joints, self._actuators = object, joints, actuators.numbers
         self._dofs = model.jnt_dofadr[joints]
         self._is_hand, self._is_object = (np.isin(model.geom_bodyid, bodies) for bodies in (hand, object))
         # Margins of the two geoms add up; pairs that are spelt out have their own.
