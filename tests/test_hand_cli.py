@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import fields
 
 import numpy as np
 import pytest
 import trimesh
 
 from jaxgrasp.cli import main
+from jaxgrasp.hands import Scene
+from jaxgrasp.synthesis import HandSynthesis
 
 HAND = """<mujoco><compiler angle="radian"/><option gravity="0 0 -9.81"/><worldbody><body name="palm">
 <geom type="box" size=".05 .05 .005" pos="0 0 -.06" group="3"/>{}</body></worldbody><actuator>{}</actuator></mujoco>"""
@@ -110,3 +113,55 @@ def test_a_hand_wants_an_object_and_grasps(folder, capsys):
     assert "--hand: got no --object or no --grasps; wanted both" in capsys.readouterr().err
     assert main(["rank", "--grasps", "grasps.npz"]) == 2
     assert "got no --hand" in capsys.readouterr().err
+
+
+def test_synthesised_grasps_are_what_rank_reads(folder, monkeypatch, capsys):
+    rng = np.random.default_rng(0)
+
+    def found(hand, key, *, starts, **_) -> HandSynthesis:
+        """In place of a search that takes minutes to compile: numbers of the right shapes."""
+        contacts, efforts = len(hand.touching_links), len(hand.actuators)
+        shapes = {"qpos": (hand.nq,), "pregrasp": (hand.nq,), "squeeze": (hand.nq,), "controls": (efforts,)}
+        shapes |= {"contact_points": (contacts, 3), "forces": (contacts, 3), "landmarks": (contacts, 3)}
+        columns = {
+            f.name: rng.normal(size=(starts, *shapes.get(f.name, ())))
+            for f in fields(HandSynthesis)
+            if f.name not in ("record", "interrupted")
+        }
+        whole = {name: np.zeros(starts, int) for name in ("verdict", "first_verdict", "status", "touching")}
+        return HandSynthesis(**{**columns, **whole}, record={}, interrupted=False)
+
+    monkeypatch.setattr("jaxgrasp.synthesis.synthesize_hand_grasps", found)
+    command = ["synthesize", *COMMAND[:8], "--scale", "0.06", "--starts", "5", "--figure", "None", "--picture", "None"]
+    assert main([*command, "--output", "found.npz"]) == 0
+    assert "hand.xml and pieces" in capsys.readouterr().out
+    with np.load("found.npz") as table:
+        columns = dict(table)
+    assert columns["joint_names"].tolist() == ["j0", "j1", "j2", "j3"] and (columns["obj_scale"] == 0.06).all()
+    built = Scene.build(hand="hand.xml", object="pieces", scale=0.06, condim=3)
+    rng = np.random.default_rng(0)
+    wanted = found(built.hand_object(), None, starts=5).qpos
+    parts = built.parts(wanted)
+    assert np.array_equal(columns["grasp_qpos"], np.c_[parts.base, parts.joints])
+    assert np.array_equal(columns["obj_pose"], parts.object)
+    unit = parts.base, parts.object
+    for poses in unit:
+        poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=-1, keepdims=True)
+    again = built.parts(built.qpos(base=unit[0], joints=parts.joints, object=unit[1]))
+    for ours, theirs in zip(again, parts, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--hand", "hand.xml"], "--object: got 'superquadric', wanted a folder"),
+        (["--hand", "hand.xml", "--object", "pieces", "--size", "0.1"], "--size or --span: got a hand, too"),
+        (["--scene", "four_fingers", "--scale", "0.1"], "--scale: got --scene, too"),
+        (["--hand", "no.xml", "--object", "pieces"], "--hand: got 'no.xml', and there is no such file"),
+    ],
+)
+def test_hands_that_cannot_be_synthesised_with_are_one_line(folder, capsys, options, message):
+    assert main(["synthesize", *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

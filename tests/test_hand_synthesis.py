@@ -274,7 +274,7 @@ def test_the_command_writes_what_rank_reads(hand, tmp_path, monkeypatch, capsys)
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--size", "0.1"], "--scene: got --size"),
+        (["--size", "0.1"], "--size or --span: got a hand, too"),
         (["--min-contacts", "0"], "--min-contacts: got 0"),
         (["--keep", "0"], "--keep: got 0"),
         (["--links", "nothing"], "links: got 'nothing'"),

@@ -29,24 +29,26 @@ class Synthesize(Reading):
     """Make grasps of an object by gradient ascent on the largest disturbance that they resist.
 
     Contacts begin at random places on the surface and move along it. Writes an .npz file of candidates that `jaxgrasp
-    rank` reads: positions about the centre of mass, outward_normals, friction, max_force, the best first. With --scene
-    a whole hand moves, its pose and its joints, and the file has configurations for `jaxgrasp rank --scene --qpos`.
+    rank` reads: positions about the centre of mass, outward_normals, friction, max_force, the best first. With --scene,
+    or --hand and --object, a whole hand moves, its pose and its joints, and the file has configurations for `jaxgrasp
+    rank --scene --qpos`, or `jaxgrasp rank --hand --object --grasps`.
     """
 
     object: str = "superquadric"
-    """sphere, ellipsoid, box, capsule, cylinder or superquadric; or a mesh FILE, .stl, .obj or .ply."""
+    """sphere, ellipsoid, box, capsule, cylinder or superquadric; or a mesh FILE, .stl, .obj or .ply. With --hand: a
+    folder of convex pieces, a mesh, an MJCF or URDF file, or sphere, capsule, box, cylinder or ellipsoid, 1 m wide."""
 
     size: float | None = None
     """Longest side of a built-in object, m; None for 0.1."""
 
     scale: float = 1.0
-    """Metres per unit of the mesh file."""
+    """Metres per unit of the mesh file; with --hand, of the object's lengths."""
 
     contacts: int = 4
     """Contacts of each grasp."""
 
     friction: float | None = None
-    """Coulomb's friction coefficient; None for 0.6, with --scene for the scene's."""
+    """Coulomb's friction coefficient; None for 0.6, with --scene or --hand for the models'."""
 
     max_force: float = 10.0
     """Largest normal force, N."""
@@ -98,8 +100,8 @@ class Synthesize(Reading):
 
         try:
             disturbances, unit = named_disturbances(self.disturbances)
-            if self.of_hand.scene:
-                names = ("friction", "max_force", "starts", "steps", "seed", "output", "figure")
+            if self.of_hand.given:
+                names = ("object", "scale", "friction", "max_force", "starts", "steps", "seed", "output", "figure")
                 return self.of_hand.run(disturbances, unit, **{name: getattr(self, name) for name in names})
             shape, centre, name, note = self._object()
         except (MeshError, CandidateError) as error:
@@ -130,12 +132,14 @@ class Synthesize(Reading):
             ("--seed", self.seed, 0 <= self.seed < 2**32, "from 0 to 2^32 - 1"),
             ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
         )
-        if self.of_hand.scene:
+        if self.of_hand.given:
             self.of_hand.check()
             if self.size is not None or self.span is not None:
-                raise CommandError("--scene: got --size or --span, too; wanted the scene's own object and hand alone")
-        inputs = [Path(self.object), Path(self.disturbances), Path(self.of_hand.scene or "")]
-        if self.of_hand.scene and self.of_hand.picture is not None:
+                raise CommandError("--size or --span: got a hand, too; wanted --scale, and the hand alone")
+            if self.of_hand.scene and self.scale != 1.0:
+                raise CommandError("--scale: got --scene, too; wanted --hand and --object with it")
+        inputs = [Path(self.object), Path(self.disturbances), Path(self.of_hand.name)]
+        if self.of_hand.given and self.of_hand.picture is not None:
             check_output(self.of_hand.picture, "--picture", FIGURE_ENDINGS, inputs)
         check_output(self.output, "--output", (".npz",), inputs)
         if self.figure is not None:

@@ -1,8 +1,9 @@
-"""`jaxgrasp synthesize --scene`: a hand and an object in, a file of configurations, a figure and pictures out."""
+"""`jaxgrasp synthesize` with a hand and an object: a file of configurations, a figure and pictures out."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from jaxgrasp.storage import atomic_write
 
 if TYPE_CHECKING:
     from jaxgrasp.disturbance import DisturbanceSet
-    from jaxgrasp.hands import HandObject
+    from jaxgrasp.hands import HandObject, Scene
     from jaxgrasp.synthesis import HandSynthesis
 
 _PICTURES = 4
@@ -62,6 +63,8 @@ class SceneSynthesis(HandScene):
         disturbances: "DisturbanceSet",
         unit: str,
         *,
+        object: str,
+        scale: float,
         friction: float | None,
         max_force: float,
         starts: int,
@@ -75,6 +78,8 @@ class SceneSynthesis(HandScene):
         Args:
             disturbances: What grasps shall withstand.
             unit: Of the margin then.
+            object: With --hand.
+            scale: Of its lengths.
             friction: Of every contact; None is the scene's.
             max_force: Of every contact, N.
             starts: How many.
@@ -94,7 +99,8 @@ class SceneSynthesis(HandScene):
         from jaxgrasp.cli.report import hand_bar, print_hand_synthesis
         from jaxgrasp.synthesis import synthesize_hand_grasps
 
-        hand = self.hand_object(friction, max_force)
+        built = self.built(object, scale, friction) if self.hand else None
+        hand = self.hand_of(built.model, None, max_force) if built else self.hand_object(friction, max_force)
         try:
             with hand_bar(starts, steps) as progress:
                 found = synthesize_hand_grasps(
@@ -109,13 +115,15 @@ class SceneSynthesis(HandScene):
                     progress=progress,
                 )
         except ValueError as error:
-            raise CommandError(f"--scene {self.scene}: {error}") from error
+            raise CommandError(f"{self.name}: {error}") from error
         kept = np.flatnonzero(found.good) if self.keep is None else found.diverse(self.keep, self.diversity)
-        written, failed = self._write(hand, found, found.take(kept), unit, output, figure)
+        name = f"{self.name} and {object}" if self.hand else self._name
+        columns = partial(_as_grasps, built, scale) if built else _as_configurations
+        written, failed = self._write(hand, found, found.take(kept), columns, name, unit, output, figure)
         if found.interrupted:
             one_line(f"{signals.word()}: grasps are those of fewer steps or starts")
         with printing():
-            print_hand_synthesis(found, len(kept), self._name, unit, written)
+            print_hand_synthesis(found, len(kept), name, unit, written)
         return 130 if found.interrupted else 2 if failed else 0
 
     @property
@@ -127,6 +135,8 @@ class SceneSynthesis(HandScene):
         hand: "HandObject",
         found: "HandSynthesis",
         kept: "HandSynthesis",
+        columns: Callable[["HandSynthesis"], dict[str, np.ndarray]],
+        name: str,
         unit: str,
         output: Path,
         figure: Path | None,
@@ -137,16 +147,14 @@ class SceneSynthesis(HandScene):
             with atomic_write(path) as stream:
                 np.savez(
                     stream,
-                    qpos=kept.qpos,
-                    pregrasp_qpos=kept.pregrasp,
-                    squeeze_qpos=kept.squeeze,
+                    **columns(kept),
                     squeeze_controls=kept.controls,
                     synthesis_margin=kept.margin,
                     self_penetration=kept.self_penetration,
                 )
 
         def write_picture(path: Path) -> None:
-            write_figure(figure_of_hand_synthesis(found, name=self._name, unit=unit), path)
+            write_figure(figure_of_hand_synthesis(found, name=name, unit=unit), path)
 
         jobs: list[tuple[Path | None, Callable[[Path], None]]] = [(figure, write_picture)]
         if len(kept.qpos):
@@ -168,3 +176,20 @@ class SceneSynthesis(HandScene):
             draw_scenes(path, hand.model, best.qpos, best.contact_points, best.forces, titles)
         except RuntimeError as error:
             raise OSError(str(error)) from error
+
+
+def _as_configurations(kept: "HandSynthesis") -> dict[str, np.ndarray]:
+    """Columns that `jaxgrasp rank --scene --qpos` reads."""
+    return {"qpos": kept.qpos, "pregrasp_qpos": kept.pregrasp, "squeeze_qpos": kept.squeeze}
+
+
+def _as_grasps(built: "Scene", scale: float, kept: "HandSynthesis") -> dict[str, np.ndarray]:
+    """Columns that `jaxgrasp rank --hand --grasps` reads: poses of the base and joints together."""
+    stages = {"grasp_qpos": kept.qpos, "pregrasp_qpos": kept.pregrasp, "squeeze_qpos": kept.squeeze}
+    parts = {name: built.parts(qpos) for name, qpos in stages.items()}
+    columns = {name: np.concatenate([p.base, p.joints], -1) for name, p in parts.items()}
+    return columns | {
+        "obj_pose": parts["grasp_qpos"].object,
+        "obj_scale": np.full(len(kept.qpos), scale),
+        "joint_names": np.array(built.joint_names),
+    }

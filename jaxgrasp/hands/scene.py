@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -19,6 +20,16 @@ from jaxgrasp.hands.object_files import OBJECT, add_object
 
 _GRAVITY_OFF = int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
 TABLE, ENVIRONMENT = "table", "environment"
+
+
+class Parts(NamedTuple):
+    """Configurations by parts; poses are position, m, and quaternion (w, x, y, z), world frame."""
+
+    base: Float[np.ndarray, "batch 7"]
+    """That of a base that is fixed is no turn and no shift."""
+    joints: Float[np.ndarray, "batch joints"]
+    """In the order of `Scene.joint_names`, rad or m."""
+    object: Float[np.ndarray, "batch 7"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -144,6 +155,19 @@ class Scene:
         for place, part in parts:
             qpos[:, place] = part
         return qpos
+
+    def parts(self, qpos: ArrayLike) -> "Parts":
+        """What `qpos` puts together, taken apart.
+
+        Args:
+            qpos: (N, nq).
+        """
+        qpos = np.asarray(qpos, float)
+        poses = [np.tile([0.0, 0, 0, 1, 0, 0, 0], (len(qpos), 1)) for _ in range(2)]
+        for k, name in enumerate((BASE, OBJECT)):
+            if mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0:
+                poses[k] = qpos[:, self._pose(name, name)]
+        return Parts(base=poses[0], joints=qpos[:, self.model.jnt_qposadr[self._joints]], object=poses[1])
 
     @cached_property
     def _joints(self) -> np.ndarray:
