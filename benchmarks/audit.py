@@ -25,10 +25,14 @@ from jaxgrasp.robustness.auditing.setting import FORMS  # noqa: E402
 BATCH, CONTACTS, ROUNDS, SHARE = 16_384, 4, 25, 0.75
 FORCES = jg.DisturbanceSet.forces(1.0)
 FIRST = """
-import time
+import sys, time
 start = time.perf_counter()
 import jax
 jax.config.update("jax_enable_x64", True)
+if len(sys.argv) > 1:
+    jax.config.update("jax_compilation_cache_dir", sys.argv[1])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 import jaxgrasp as jg
 from benchmarks.suite import problems
 grasps = problems.sample(64, 4)
@@ -74,25 +78,27 @@ def measure(dtype: type) -> list[str]:
 
 
 def first_answers() -> list[str]:
-    """Rows of the table: seconds to a first answer in a new process, best of three, kernels on disk or not."""
+    """Rows of the table: seconds to a first answer in a new process, best of four, by what is on disk."""
     rows = []
-    for disk in (True, False):
-        seconds = {}
-        for form in FORMS:
-            runs = []
-            for _ in range(3):
-                with tempfile.TemporaryDirectory() as folder:
-                    setting = os.environ | {"JAXGRASP_AUDIT": form}
-                    setting |= {} if disk else {"XDG_CACHE_HOME": folder}
-                    told = subprocess.run(
-                        [sys.executable, "-c", FIRST], env=setting, capture_output=True, text=True, check=True
-                    )
-                    runs.append(float(told.stdout))
-            seconds[form] = min(runs)
-            say(f"  first answer, {form}, kernels on disk {disk}: {seconds[form]:.2f} s")
-        cells = " | ".join(f"{seconds[form]:.2f}" for form in ("off", *FORMS[:-1]))
-        rows.append(f"| {'on disk' if disk else 'compiled'} | {cells} |")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, caches in {
+            "kernels and XLA's programs": (True, folder),
+            "kernels": (True,),
+            "nothing": (False,),
+        }.items():
+            seconds = {form: min(_first(form, *caches) for _ in range(4)) for form in FORMS}
+            say(f"  first answer, {name} on disk: {seconds}")
+            cells = " | ".join(f"{seconds[form]:.2f}" for form in ("off", *FORMS[:-1]))
+            rows.append(f"| {name} | {cells} |")
     return rows
+
+
+def _first(form: str, kernels: bool, programs: str | None = None) -> float:
+    """Seconds to a first answer, with kernels on disk or without, and XLA's programs in a folder or nowhere."""
+    with tempfile.TemporaryDirectory() as folder:
+        setting = os.environ | {"JAXGRASP_AUDIT": form} | ({} if kernels else {"XDG_CACHE_HOME": folder})
+        command = [sys.executable, "-c", FIRST, *([programs] if programs else [])]
+        return float(subprocess.run(command, env=setting, capture_output=True, text=True, check=True).stdout)
 
 
 def main() -> None:
@@ -107,9 +113,9 @@ def main() -> None:
 |---|---|---|---|---|
 {chr(10).join(rows)}
 
-Seconds to the first margins of 64 grasps in a new process, imports included, best of three:
+Seconds to the first margins of 64 grasps in a new process, imports included, best of four:
 
-| kernels | off | sampled | strict |
+| on disk | off | sampled | strict |
 |---|---|---|---|
 {chr(10).join(first_answers())}
 """

@@ -48,6 +48,7 @@ def configure_jax() -> None:
     folder = _folder_of_programs()
     if folder is not None and jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     try:
         # One program runs on one core; as many devices as cores make a batch run on all of them.
         jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
