@@ -4,13 +4,15 @@
 
 Plain grasps: 3 to 8 contacts on random ellipsoids of 1 to 20 cm, friction 0.3 to 1, one largest force for all fingers,
 margins that are a random share of (21)'s, half of the grasps with a load. What is called solved is checked in float64:
-G f = b and every row at the margin by NumPy, the effort and the largest margin against the float64 programs.
+G f = b and every row at the margin by NumPy, the effort and the largest margin against the float64 programs. Writes
+float32_efforts.md beside this file.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -108,25 +110,31 @@ def main() -> None:
     parser.add_argument("--grasps", type=int, default=200_000)
     each = parser.parse_args().grasps // (2 * len(COUNTS))
     jax.config.update("jax_enable_x64", True)
-    say("| contacts | load | grasps | undecided | ill-conditioned | infeasible | solved and wrong |")
-    say("| --- | --- | --- | --- | --- | --- | --- |")
-    lines = []
+    rows, counts = [], []
     for loaded in (False, True):
         for n_c in COUNTS:
             grasps = plain(each, n_c, loaded, 0)
             largest, least = solved(grasps, "float32")
             margin = (np.maximum(np.nan_to_num(largest.margin), 0) * grasps.share).astype(np.float32)
-            names = ("MAX_ITERATIONS", "ILL_CONDITIONED", "INFEASIBLE", "SOLVED")
-            stuck, ill, never, answered = (least.status == jg.Status[name] for name in names)
+            names = ("MAX_ITERATIONS", "ILL_CONDITIONED", "INFEASIBLE", "NOT_VERIFIED", "SOLVED")
+            stuck, ill, never, doubted, answered = (least.status == jg.Status[name] for name in names)
             bad = answered & wrong(grasps, least, solved(grasps, "float64", margin))
-            lines.append([x.sum() for x in (stuck | ill, ill, never, bad)])
-            say(f"| {n_c} | {'yes' if loaded else 'no'} | {each:,} | " + " | ".join(map(str, lines[-1])) + " |")
-    total = np.sum(lines, 0)
-    say(
-        f"| all | | {each * len(lines):,} | {total[0] / each / len(lines):.3%} | "
-        + " | ".join(map(str, total[1:]))
-        + " |"
-    )
+            counts.append([x.sum() for x in (stuck | ill | doubted, ill, never, bad)])
+            rows.append(f"| {n_c} | {'yes' if loaded else 'no'} | {each:,} | {' | '.join(map(str, counts[-1]))} |")
+            say(rows[-1])
+    total, grasps = np.sum(counts, 0), each * len(counts)
+    rows.append(f"| all | | {grasps:,} | {total[0]} ({total[0] / grasps:.2%}) | {' | '.join(map(str, total[1:]))} |")
+    text = f"""# Least efforts in float32
+
+`python -m benchmarks.float32_efforts --grasps {grasps}`: plain grasps on random ellipsoids, margins that are a share of
+the largest, with and without a load. What is called solved is checked in float64.
+
+| contacts | load | grasps | undecided | of these ill-conditioned | infeasible | solved and wrong |
+| --- | --- | --- | --- | --- | --- | --- |
+{chr(10).join(rows)}
+"""
+    Path(__file__).with_suffix(".md").write_text(text)
+    say(text)
 
 
 if __name__ == "__main__":
