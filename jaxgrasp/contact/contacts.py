@@ -4,11 +4,13 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals, placed
 from jaxgrasp.compiling import compiled
+from jaxgrasp.direct import filled, is_direct, power_of_two
 from jaxgrasp.records import record
 
 
@@ -80,7 +82,8 @@ class Contacts:
             active=present.shape[:-1],
         )
         leaves = positions, frames, friction, max_force, present
-        return cls(**dict(zip(_EVENTS, _spread(batch, leaves), strict=True)))
+        spread = _spread_directly if is_direct(leaves) else _spread
+        return cls(**dict(zip(_EVENTS, spread(batch, leaves), strict=True)))
 
     @classmethod
     def from_normals(
@@ -112,9 +115,7 @@ class Contacts:
                 f"outward_normals: got shape {normals.shape}, wanted (*batch, {n_c}, 3) "
                 f"like positions {jnp.shape(positions)}"
             )
-        return cls.from_frames(
-            positions, frames_from_normals(normals), friction=friction, max_force=max_force, active=active
-        )
+        return cls.from_frames(positions, _frames(normals), friction=friction, max_force=max_force, active=active)
 
     def check_precision(self) -> None:
         """Refuse what nothing here can compute with.
@@ -137,6 +138,8 @@ class Contacts:
         return self.positions.shape[-2]
 
 
+# Their frames take no time, however few they are.
+_FEW_NORMALS = 1024
 _EVENTS = {"positions": (3,), "frames": (3, 3), "friction": (), "max_force": (), "active": ()}
 
 
@@ -149,6 +152,25 @@ def _spread(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.A
         jnp.broadcast_to(x if x.dtype == bool else x.astype(dtype), (*batch, n_c, *event))
         for x, event in zip(leaves, _EVENTS.values(), strict=True)
     ]
+
+
+def _spread_directly(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.Array]:
+    """The same, where nothing need be compiled."""
+    positions, frames = leaves[:2]
+    dtype, n_c = jnp.result_type(positions, frames), positions.shape[-2]
+    return [
+        jax.device_put(np.broadcast_to(np.asarray(x, x.dtype if x.dtype == bool else dtype), (*batch, n_c, *event)))
+        for x, event in zip(leaves, _EVENTS.values(), strict=True)
+    ]
+
+
+def _frames(normals: jax.Array) -> jax.Array:
+    """`frames_from_normals`, in direct calls by one program for many shapes."""
+    if not normals.size or not is_direct([normals]):
+        return frames_from_normals(normals)
+    flat = np.asarray(normals).reshape(-1, 3)
+    frames = frames_from_normals(filled(flat, power_of_two(len(flat), _FEW_NORMALS)))
+    return jax.device_put(np.asarray(frames)[: len(flat)].reshape(*normals.shape, 3))
 
 
 def rotations(frames: jax.Array) -> jax.Array:

@@ -23,6 +23,8 @@ _PUBLIC = {
     "per_vertex": "compliance",
     "weights": "effort_weights",
 }
+# Trailing axes of the leaves of `Actuation`.
+ACTUATION_EVENTS = {"jacobian": 3, "transmission": 2, "inverse": 2, "unreached": 2, "lower": 1, "upper": 1}
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,5 @@ def _actuation(actuation: Actuation, n: int) -> dict[str, tuple[jax.Array, tuple
             f"actuation: got a jacobian of shape {actuation.jacobian.shape}, wanted (*batch, {n}, 3, n_v), "
             f"one for each of the {n} contacts"
         )
-    trailing = {"jacobian": 3, "transmission": 2, "inverse": 2, "unreached": 2, "lower": 1, "upper": 1}
-    leaves = {name: getattr(actuation, name) for name in trailing}
-    return {name: (x, x.shape[: x.ndim - trailing[name]]) for name, x in leaves.items() if x is not None}
+    leaves = {name: getattr(actuation, name) for name in ACTUATION_EVENTS}
+    return {name: (x, x.shape[: x.ndim - ACTUATION_EVENTS[name]]) for name, x in leaves.items() if x is not None}

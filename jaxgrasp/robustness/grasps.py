@@ -15,6 +15,7 @@ from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
+from jaxgrasp.direct import cut
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.kernels import usable
@@ -22,6 +23,7 @@ from jaxgrasp.robustness.arguments import Arguments, laid_out
 from jaxgrasp.robustness.auditing import audited
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
+from jaxgrasp.robustness.sizes import with_a_known_size
 from jaxgrasp.solvers.lanes import LOOSE_TILE, TILE
 
 
@@ -96,7 +98,7 @@ def over_grasps(
     """Check shapes, run a kernel over all grasps of a batch, audit its results and give them the batch's shape.
 
     The kernel takes `Grasps`. The contacts' dtype is the precision of everything. Compiled once for a kernel (they
-    compare by value) and the shapes.
+    compare by value) and the shapes, which `sizes` keeps few.
 
     Raises:
         ValueError: shapes or kinds of argument that do not fit.
@@ -123,7 +125,12 @@ def over_grasps(
     if actuation is not None and not actuation.transmission.shape[-1]:
         raise ValueError("actuation: got no actuators, wanted at least one; leave it out and fingers push at will")
     given["actuation"] = actuation
-    return audited(kernel, _run(kernel, contacts, disturbances, given), contacts, disturbances, given)
+    fill = with_a_known_size(kernel, contacts, disturbances, given)
+    if fill is None:
+        return audited(kernel, _run(kernel, contacts, disturbances, given), contacts, disturbances, given)
+    count = fill.count
+    out = _run(kernel, fill.contacts, disturbances, fill.given)
+    return cut(audited(kernel, out, fill.contacts, disturbances, fill.given, count), count)
 
 
 @functools.partial(compiled, static_argnums=(0,), pace=lambda: "brief" if usable() else "fast")

@@ -1,0 +1,44 @@
+"""Direct calls: all arrays are known, on the default CPU, and nobody transforms the call.
+
+NumPy can then lay them out, and nothing is compiled for it; and a batch can be filled up to a size for which there is a
+program already.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Tree = Any
+
+
+def is_direct(leaves: Iterable[Any]) -> bool:
+    """Whether a call of these arrays is direct."""
+    if jax.default_backend() != "cpu" or not jax.sharding.get_abstract_mesh().empty:
+        return False
+    # Inside somebody's jit every operation gives a tracer, even one on constants.
+    known = all(isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer) and not x.committed for x in leaves)
+    return known and not isinstance(jnp.zeros(()), jax.core.Tracer)
+
+
+def power_of_two(count: int, least: int) -> int:
+    """The smallest power of two that is not below the count, nor below another one."""
+    return max(least, 1 << max(count - 1, 0).bit_length())
+
+
+def filled(x: jax.Array | np.ndarray, size: int) -> jax.Array:
+    """An array (count, ...) with copies of its last entry up to (size, ...)."""
+    own = np.asarray(x)
+    if len(own) == size:
+        return jax.device_put(x)
+    more = np.empty((size, *own.shape[1:]), own.dtype)
+    more[: len(own)] = own
+    more[len(own) :] = own[-1]
+    return jax.device_put(more)
+
+
+def cut(tree: Tree, count: int) -> Tree:
+    """Leaves (size, ...) without what they were filled with."""
+    return jax.tree.map(lambda x: x if len(x) == count else jax.device_put(np.asarray(x)[:count]), tree)
