@@ -10,10 +10,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.assaults import arrays  # noqa: E402
+from benchmarks.assaults.commands import unsolved  # noqa: E402
 from benchmarks.assaults.inputs import cases  # noqa: E402
-from jaxgrasp.candidates import CandidateError, Candidates, read_candidates, read_wrenches  # noqa: E402
+from jaxgrasp.candidates import CandidateError, read_candidates, read_wrenches  # noqa: E402
 from jaxgrasp.geometry import Mesh, MeshError  # noqa: E402
-from jaxgrasp.ranking import Ranking, write_table  # noqa: E402
+from jaxgrasp.ranking import write_table  # noqa: E402
 
 
 def candidates(path: Path, folder: Path) -> None:
@@ -21,24 +22,7 @@ def candidates(path: Path, folder: Path) -> None:
     with np.load(path, allow_pickle=False) as theirs:
         np.testing.assert_array_equal(found.positions, theirs["positions"].astype(float))
     for ending in (".parquet", ".csv", ".npz"):
-        write_table(ranking(found), folder / f"table{ending}")
-
-
-def ranking(found: Candidates) -> Ranking:
-    none = np.zeros((0, found.num_contacts, 3))
-    return Ranking(
-        candidates=found,
-        margin=np.zeros(len(found)),
-        upper_bound=np.zeros(len(found)),
-        status=np.zeros(len(found), int),
-        order=np.arange(len(found)),
-        share=0.75,
-        forces=none,
-        object_forces=none,
-        effort=np.zeros(0),
-        tightening_status=np.zeros(0, int),
-        controls=np.zeros((0, 0)),
-    )
+        write_table(unsolved(found), folder / f"table{ending}")
 
 
 def wrenches(path: Path, folder: Path) -> None:

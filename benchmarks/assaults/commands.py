@@ -36,3 +36,23 @@ def empty(folder: Path) -> None:
     """Removes what commands have written."""
     for path in made(folder):
         path.unlink()
+
+
+def unsolved(candidates: Any, *_: Any, **__: Any) -> Any:
+    """A ranking of candidates in the order that they have, in place of one that takes a compilation."""
+    from jaxgrasp.ranking import Ranking
+
+    count, none = len(candidates), np.zeros((0, candidates.num_contacts, 3))
+    return Ranking(
+        candidates=candidates,
+        margin=np.ones(count),
+        upper_bound=np.ones(count),
+        status=np.zeros(count, int),
+        order=np.arange(count),
+        share=0.75,
+        forces=none,
+        object_forces=none,
+        effort=np.zeros(0),
+        tightening_status=np.zeros(0, int),
+        controls=np.zeros((0, 0)),
+    )
