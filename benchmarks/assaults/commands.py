@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +39,11 @@ def empty(folder: Path) -> None:
         path.unlink()
 
 
-def unsolved(candidates: Any, *_: Any, **__: Any) -> Any:
+def unsolved(candidates: Any, *_: Any, progress: Callable[[int], None] = lambda _: None, **__: Any) -> Any:
     """A ranking of candidates in the order that they have, in place of one that takes a compilation."""
     from jaxgrasp.ranking import Ranking
 
+    progress(len(candidates))
     count, none = len(candidates), np.zeros((0, candidates.num_contacts, 3))
     return Ranking(
         candidates=candidates,
