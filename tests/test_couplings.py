@@ -1,0 +1,68 @@
+"""Hands whose joints follow each other by equality constraints."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from test_passive import PUSHES, closed, four_pads, independent_margin, ranked
+
+import jaxgrasp as jg
+from jaxgrasp.hands import HandObject
+
+COUPLED = {
+    "linear": '<equality><joint joint1="j1" joint2="j0" polycoef="0 1 0 0 0"/></equality>',
+    "pinned": '<equality><joint joint1="j1" polycoef="0.02 0 0 0 0"/></equality>',
+    "chain": '<equality><joint joint1="j3" polycoef="0.02 0 0 0 0"/>'
+    '<joint joint1="j2" joint2="j1" polycoef="0 1 0 0 0"/>'
+    '<joint joint1="j1" joint2="j0" polycoef="0.01 0.5 0 0 0"/></equality>',
+}
+
+
+@pytest.mark.parametrize(("kind", "engine"), [*((kind, "mujoco") for kind in COUPLED), ("chain", "distance")])
+def test_linear_couplings(kind, engine):
+    """The same as with a vanishing quadratic term, which takes the way of couplings that vary."""
+    found = []
+    for xml in (four_pads(rest=COUPLED[kind]), four_pads(rest=COUPLED[kind].replace(" 0 0 0", " 1e-12 0 0"))):
+        model = mujoco.MjModel.from_xml_string(xml)
+        found.append(HandObject.from_mjcf(model, "object").grasps(closed(model), engine))
+    for name in ("jacobian", "transmission", "inverse", "lower", "upper"):
+        one, other = (np.asarray(getattr(grasps.actuation, name)) for grasps in found)
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["linear", "pinned"])
+def test_margins_of_coupled_hands(kind):
+    """An actuator whose joint is pinned acts on nothing."""
+    _, grasps, found = ranked(four_pads(rest=COUPLED[kind]))
+    assert found.status == jg.Status.SOLVED
+    np.testing.assert_allclose(found.margin, independent_margin(grasps), rtol=1e-6)
+
+
+def test_a_gripper_whose_slides_are_coupled():
+    """One actuator on the mean of two slides; the two pads of each jaw share what it exerts."""
+    jaws = ""
+    for name, y, pads in (("left", 1, ("0 0 .015", "0 0 -.015")), ("right", -1, (".015 0 0", "-.015 0 0"))):
+        spheres = "".join(f'<geom size="0.01" pos="{at}" mass="0.05" friction="0.8"/>' for at in pads)
+        jaws += (
+            f'<body pos="0 {0.05 * y} 0"><joint name="{name}" type="slide" axis="0 {-y} 0" range="0 0.025"/>{spheres}'
+        )
+        jaws += "</body>"
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="palm">{jaws}</body><body name="object"><freejoint/><geom type="box" '
+        'size="0.025 0.025 0.025" mass="0.2" friction="0.8"/></body></worldbody><tendon><fixed name="mean"><joint '
+        'joint="left" coef="0.5"/><joint joint="right" coef="0.5"/></fixed></tendon><equality><joint joint1="right" '
+        'joint2="left"/></equality><actuator><general tendon="mean" gainprm="0.392156863" biastype="affine" '
+        'biasprm="0 -4000 -40" ctrlrange="0 255" forcerange="-60 60"/></actuator></mujoco>'
+    )
+    hand = HandObject.from_mjcf(model, "object", points_per_link=None)
+    grasps = hand.grasps(np.r_[0.015, 0.015, model.qpos0[2:]])
+    given = {"required_wrench": grasps.required_wrench, "actuation": grasps.actuation}
+    found = jg.largest_disturbance(grasps.contacts, PUSHES, **given)
+    # Of the same gripper with a coupling that is almost linear, by hand and by C MuJoCo.
+    assert float(found.margin) == pytest.approx(16.6878, abs=1e-3)
+    least = jg.least_effort(grasps.contacts, PUSHES, 0.75 * found.margin, **given)
+    assert float(least.effort) == pytest.approx(41.42, abs=0.01)
+    # The actuator gives what all four pads press with.
+    assert float(least.actuator_efforts[0]) == pytest.approx(18.097, abs=1e-2)
+    np.testing.assert_allclose(-least.forces[:, 2].sum(), least.actuator_efforts[0], rtol=1e-6)
