@@ -186,3 +186,24 @@ def test_an_object_meets_every_mask_of_the_hand(files, tmp_path):
     for object in ("sphere", files / "pieces"):
         hand = Scene.build(hand=path, object=object, scale=0.05).hand_object()
         assert {hand.model.body(b).name for b in hand.touching_links} == {"palm", "f1", "f2"}
+
+
+def test_a_left_hand_is_the_mirror_image_of_a_right_one(files, tmp_path):
+    """What turns about x turns the other way behind a mirror along y."""
+    path, mirror = tmp_path / "left.xml", np.array([1.0, -1.0, 1.0])
+    path.write_text(HAND.replace('pos="0 .02 .01"', 'pos="0 -.02 .01"').replace('axis="1 0 0"', 'axis="-1 0 0"'))
+    found = []
+    for hand, side in ((files / "hand.xml", 1), (path, -1)):
+        scene = Scene.build(hand=hand, object="sphere", scale=0.05, base="fixed")
+        qpos = scene.qpos(joints=[0.2, 0.1], object=[0.005, 0.05 * side, 0.09, 1, 0, 0, 0])
+        found.append(scene.hand_object(contact_distance=0.05).grasps(qpos))
+    right, left = found
+    np.testing.assert_allclose(left.distances, right.distances, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(left.contacts.positions) * mirror, right.contacts.positions, atol=1e-9)
+    forces = np.random.default_rng(0).normal(size=(*right.distances.shape, 3))
+    torques = []
+    for grasps, turn in ((right, 1), (left, mirror)):
+        pushed = np.einsum("ncji,ncj->nci", np.asarray(grasps.contacts.frames), forces * turn)
+        torques.append(grasps.actuation.joint_torques(pushed))
+    assert np.abs(torques[0]).max() > 1e-3
+    np.testing.assert_allclose(*torques, atol=1e-9)
