@@ -57,32 +57,29 @@ FUNCTIONS: dict[str, Callable] = {
 }
 
 
-def _total(f: Callable, p: jax.Array, c: jg.Contacts) -> jax.Array:
+def total(f: Callable, p: jax.Array, c: jg.Contacts) -> jax.Array:
     value = f(replace(c, positions=p))
     return jnp.where(jnp.isfinite(value), value, 0).sum()
 
 
-def _slope(f: Callable, c: jg.Contacts) -> jax.Array:
-    return jax.grad(lambda p: _total(f, p, c))(c.positions)
+def slope(f: Callable, c: jg.Contacts) -> jax.Array:
+    return jax.grad(lambda p: total(f, p, c))(c.positions)
 
 
-def _along(f: Callable, c: jg.Contacts) -> jax.Array:
+def along(f: Callable, c: jg.Contacts) -> jax.Array:
     return jax.jvp(lambda p: f(replace(c, positions=p)), (c.positions,), (jnp.ones_like(c.positions),))[1]
 
 
 def _custom_vjp(f: Callable, c: jg.Contacts) -> jax.Array:
-    @jax.custom_vjp
-    def total(p: jax.Array) -> jax.Array:
-        return _total(f, p, c)
-
-    total.defvjp(lambda p: jax.vjp(lambda p: _total(f, p, c), p), lambda back, ct: back(ct))
-    return jax.grad(total)(c.positions)
+    own = jax.custom_vjp(lambda p: total(f, p, c))
+    own.defvjp(lambda p: jax.vjp(lambda p: total(f, p, c), p), lambda back, ct: back(ct))
+    return jax.grad(own)(c.positions)
 
 
 def _custom_jvp(f: Callable, c: jg.Contacts) -> jax.Array:
-    total = jax.custom_jvp(lambda p: _total(f, p, c))
-    total.defjvp(lambda p, dp: jax.jvp(lambda p: _total(f, p, c), p, dp))
-    return jax.grad(total)(c.positions)
+    own = jax.custom_jvp(lambda p: total(f, p, c))
+    own.defjvp(lambda p, dp: jax.jvp(lambda p: total(f, p, c), p, dp))
+    return jax.grad(own)(c.positions)
 
 
 def _cond(f: Callable, c: jg.Contacts) -> jax.Array:
@@ -125,32 +122,78 @@ def _pmap(f: Callable, c: jg.Contacts) -> jax.Array:
     return out.reshape(-1, *out.shape[2:])
 
 
-# Each gives what the plain call does; those of SLOPED what `_slope` or `_along` do.
-WAYS: dict[str, Callable] = {
+def _pmap_shared(f: Callable, c: jg.Contacts) -> jax.Array:
+    each = jax.pmap(lambda p, c: f(replace(c, positions=p)), in_axes=(0, None))
+    return each(jnp.stack([c.positions] * 2), c)[1]
+
+
+def _custom_vmap(f: Callable, c: jg.Contacts) -> jax.Array:
+    one = jax.custom_batching.custom_vmap(f)
+    one.def_vmap(lambda size, batched, c: (jax.vmap(f)(c), True))
+    return jax.vmap(one)(c)
+
+
+def _callback(f: Callable, c: jg.Contacts) -> jax.Array:
+    def beside(c: jg.Contacts) -> jax.Array:
+        value = f(c)
+        return value + jax.pure_callback(np.zeros_like, jax.ShapeDtypeStruct(value.shape, value.dtype), value)
+
+    return jax.jit(beside)(c)
+
+
+# What each gives the plain call does, too,
+PLAIN: dict[str, Callable] = {
     "jit": lambda f, c: jax.jit(f)(c),
+    "compiled ahead": lambda f, c: jax.jit(f).lower(c).compile()(c),
+    "donated": lambda f, c: jax.jit(f, donate_argnums=0)(jax.tree.map(jnp.copy, c)),
     "closed over": lambda f, c: jax.jit(lambda x: f(c) + 0 * x)(0.0),
     "vmap": lambda f, c: jax.vmap(f)(c),
+    "custom_vmap": _custom_vmap,
     "lax.map": lambda f, c: jax.lax.map(f, jax.tree.map(lambda x: x[None], c))[0],
+    "lax.map in batches": lambda f, c: jax.lax.map(f, c, batch_size=2),
     "scan": lambda f, c: jax.lax.scan(lambda s, c: (s, f(c)), 0, jax.tree.map(lambda x: x[None], c))[1][0],
+    "after associative_scan": lambda f, c: jax.jit(lambda c: f(jax.lax.associative_scan(lambda a, b: b, c)))(c),
     "while_loop": _while,
     "cond": _cond,
+    "beside a callback": _callback,
     "divided": _divided(False),
     "divided, explicit": _divided(True),
     "shard_map": _shard_map,
+    "vmap in shard_map": lambda f, c: _shard_map(jax.vmap(f), c),
+    "shard_map in vmap": lambda f, c: jax.vmap(lambda c: _shard_map(f, c))(jax.tree.map(lambda x: x[None], c))[0],
     "set_mesh": _set_mesh,
     "pmap": _pmap,
-    "jvp": _along,
-    "jit jvp": lambda f, c: jax.jit(lambda c: _along(f, c))(c),
-    "grad": _slope,
-    "jit grad": lambda f, c: jax.jit(lambda c: _slope(f, c))(c),
-    "checkpoint": lambda f, c: _slope(jax.checkpoint(f), c),
+    "pmap, shared": _pmap_shared,
+}
+# what `along` does,
+FORWARD: dict[str, Callable] = {
+    "jvp": along,
+    "jit jvp": lambda f, c: jax.jit(lambda c: along(f, c))(c),
+    "linearize": lambda f, c: jax.linearize(lambda p: f(replace(c, positions=p)), c.positions)[1](
+        jnp.ones_like(c.positions)
+    ),
+}
+# and what `slope` does.
+REVERSE: dict[str, Callable] = {
+    "grad": slope,
+    "jit grad": lambda f, c: jax.jit(lambda c: slope(f, c))(c),
+    "vmap grad": lambda f, c: jax.vmap(lambda c: slope(f, c))(c),
+    "vjp with more": lambda f, c: jax.vjp(lambda p: (total(f, p, c), p), c.positions, has_aux=True)[1](1.0)[0],
+    "checkpoint": lambda f, c: slope(jax.checkpoint(f), c),
+    "checkpoint, all saved": lambda f, c: slope(
+        jax.checkpoint(f, policy=jax.checkpoint_policies.everything_saveable), c
+    ),
     "custom_vjp": _custom_vjp,
     "custom_jvp": _custom_jvp,
-    "slope, divided": lambda f, c: _divided(False)(lambda c: _slope(f, c), c),
-    "slope, shard_map": lambda f, c: _shard_map(lambda c: _slope(f, c), c),
+    "slope, divided": lambda f, c: _divided(False)(lambda c: slope(f, c), c),
+    "slope, shard_map": lambda f, c: _shard_map(lambda c: slope(f, c), c),
 }
-SLOPED = {"jvp": _along, "jit jvp": _along} | dict.fromkeys(list(WAYS)[14:], _slope)
-EVEN = {"divided", "divided, explicit", "shard_map", "pmap", "slope, divided", "slope, shard_map"}
+WAYS = PLAIN | FORWARD | REVERSE
+SLOPED = dict.fromkeys(FORWARD, along) | dict.fromkeys(REVERSE, slope)
+EVEN = {
+    *("divided", "divided, explicit", "shard_map", "vmap in shard_map", "shard_map in vmap", "pmap"),
+    *("slope, divided", "slope, shard_map"),
+}
 
 
 def cell(function: str, way: str, size: int, vertices: int = 6, contacts: int = 4) -> str:
