@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+
+from benchmarks.assaults.commands import GRASPS, PROGRAM, empty, write_grasps
 
 COMMANDS = {
     "rank": ["rank", "grasps.npz"],
@@ -51,6 +54,9 @@ def environments(root: Path) -> list[Environment]:
         Environment("LANG=C", {"LANG": "C", "LC_ALL": "C"}),
         Environment("PYTHONIOENCODING=ascii", {"PYTHONIOENCODING": "ascii"}),
         Environment("PYTHONUTF8=0 in latin-1", {"PYTHONUTF8": "0", "PYTHONIOENCODING": "latin-1"}),
+        Environment("NO_COLOR, TERM=dumb", {"NO_COLOR": "1", "TERM": "dumb"}),
+        Environment("vectors of 128 bits", {"JAXGRASP_VECTOR_BITS": "128"}),
+        Environment("then of 256 bits, the same cache", {"JAXGRASP_VECTOR_BITS": "256"}),
         Environment("HOME that is a file", {"HOME": str(root / "no_folder"), "XDG_CACHE_HOME": None}),
         Environment("standard output closed", after=" >&-"),
         Environment("all streams closed", after=" <&- >&- 2>&-"),
@@ -72,7 +78,7 @@ def outcome(arguments: list[str], given: Environment, home: Path) -> str:
     for name, value in given.variables.items():
         if value is None:
             variables.pop(name, None)
-    command = " ".join([f"{sys.executable} -m jaxgrasp.cli", *arguments])
+    command = shlex.join([*PROGRAM, *arguments])
     process = subprocess.run(
         ["bash", "-c", f"{given.shell}{command}{given.after}"],
         cwd=home,
@@ -102,26 +108,14 @@ def main() -> None:
         root.chmod(0o755)
         home.mkdir()
         home.chmod(0o777)
-        from jaxgrasp.candidates import sample_grasps
-
-        grasps = sample_grasps(50)
-        np.savez(
-            home / "grasps.npz",
-            positions=grasps.positions,
-            outward_normals=grasps.normals,
-            friction=grasps.friction,
-            max_force=grasps.max_force,
-            object_name=np.full(50, "größe 猫 $x_\\{"),
-        )
-        (home / "grasps.npz").chmod(0o644)
+        write_grasps(home, 50, object_name=np.full(50, "größe 猫 $x_\\{"))
+        (home / GRASPS).chmod(0o644)
         for given in environments(root):
             if (output.only or "") not in given.name:
                 continue
             cells = []
             for arguments in COMMANDS.values():
-                for path in home.iterdir():
-                    if path.name != "grasps.npz":
-                        path.unlink()
+                empty(home)
                 (home / "out").touch()
                 (home / "out").chmod(0o666)
                 cells.append(outcome(arguments, given, home))
