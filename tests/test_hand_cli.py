@@ -93,6 +93,7 @@ def test_compare_takes_the_same_and_leaves_nothing_out(folder, capsys):
         (["--grasps", "none.npz"], "none.npz: got fields qpos; wanted grasp_qpos"),
         (["--grasps", "nix.npz"], "nix.npz"),
         (["--scene", "four_fingers"], "--hand: got --scene, too"),
+        (["--engine", "mjx"], "only where they penetrate, and contacts up to 0.005 m apart are wanted"),
         (["--engine", "bullet"], "--engine: got bullet; wanted one of mujoco, distance"),
         (["--unreached", "loose"], "--unreached: got loose; wanted held or free"),
         (["--qpos", "q.npy"], "--qpos: got --hand, too; wanted --grasps"),

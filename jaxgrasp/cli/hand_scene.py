@@ -154,6 +154,7 @@ class HandScene:
             CommandError: It cannot be used.
         """
         from jaxgrasp.hands import HandObject
+        from jaxgrasp.hands.engines import engine_for
 
         try:
             with warnings.catch_warnings(record=True) as told:
@@ -170,6 +171,8 @@ class HandScene:
                     friction=friction,
                     max_force=10.0 if max_force is None else max_force,
                 )
+                # What the engine cannot find is told before long work.
+                hand.engine(engine_for(self.engine, None))
         except (ValueError, OSError) as error:
             raise CommandError(f"{self.name}: {' '.join(str(error).split())}") from error
         for warning in told:

@@ -18,7 +18,7 @@ from jaxgrasp.hands.actuators import Actuators
 from jaxgrasp.hands.contact_parameters import ContactParameters, hand_object_pairs
 from jaxgrasp.hands.engines import Geometry
 from jaxgrasp.hands.link_contacts import RawPoints
-from jaxgrasp.hands.mjx_models import allowing_mjx, mjx_of
+from jaxgrasp.hands.mjx_models import allowing_mjx, mjx_module, mjx_of
 from jaxgrasp.hands.passive import spring_torques
 from jaxgrasp.hands.tendons import transmission_of
 
@@ -116,8 +116,7 @@ class MjxEngine:
         return Geometry(raw, rotation, centre, anchors, axes, lengths, moments, springs)
 
     def _one(self, device, data, qpos: jax.Array, kept: np.ndarray) -> tuple[jax.Array, ...]:
-        from mujoco import mjx
-
+        mjx = mjx_module()
         placed = mjx.kinematics(device, data.replace(qpos=qpos))
         contact = mjx.collision(device, placed)._impl.contact
         shares = jnp.asarray(self._shares, placed.xipos.dtype)
@@ -134,8 +133,7 @@ class MjxEngine:
     @cached_property
     def slots(self) -> "Slots":
         """The contacts that MJX may find, the same ones in every configuration."""
-        from mujoco import mjx
-
+        mjx = mjx_module()
         with allowing_mjx(), jax.ensure_compile_time_eval():
             device, data = mjx_of(self._model)
             traced = jax.make_jaxpr(lambda data: mjx.collision(device, data)._impl.contact.geom)(data)

@@ -3,6 +3,7 @@
 import contextlib
 import io
 from collections.abc import Iterator
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -16,16 +17,20 @@ def allowing_mjx() -> Iterator[None]:
         yield
 
 
+def mjx_module() -> ModuleType:
+    """MJX, which takes seconds to import, and says on standard output that NVIDIA's Warp is not installed."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
+
+
 def mjx_of(model: mujoco.MjModel) -> tuple[Any, Any]:
     """MJX's model and data, in the precision that JAX has now; known while tracing.
 
     Raises:
         ValueError: MJX does not know something in the model.
     """
-    # MJX takes seconds to import, and says on standard output that its version for NVIDIA's Warp is not installed.
-    with contextlib.redirect_stdout(io.StringIO()):
-        from mujoco import mjx
-
+    mjx = mjx_module()
     try:
         with jax.ensure_compile_time_eval():
             device = mjx.put_model(model, impl="jax")

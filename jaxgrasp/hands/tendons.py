@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from jaxgrasp.hands.actuators import Actuators
-from jaxgrasp.hands.mjx_models import allowing_mjx, mjx_of
+from jaxgrasp.hands.mjx_models import allowing_mjx, mjx_module, mjx_of
 
 
 def transmission_of(
@@ -46,8 +46,7 @@ def spatial_transmission(model: mujoco.MjModel) -> Callable[[jax.Array], tuple[j
     def transmission(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         with allowing_mjx():
             device, data = mjx_of(model)
-            from mujoco import mjx
-
+            mjx = mjx_module()
             found = mjx.com_pos(device, mjx.kinematics(device, data.replace(qpos=qpos)))
             found = mjx.transmission(device, mjx.tendon(device, found))
             return found.actuator_length, found._impl.actuator_moment
