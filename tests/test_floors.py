@@ -10,9 +10,10 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "jaxgrasp"
 
 FLOORS = {
-    "process": -1,
+    "process": -2,
+    "compiling": -1,
     "arrays": 0,
-    "compiling": 0,
+    "direct": 0,
     "fence": 0,
     "storage": 0,
     "records": 0,
