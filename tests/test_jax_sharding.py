@@ -14,6 +14,7 @@ from jax.sharding import PartitionSpec as P
 from jax_sample import PUSHES, at, grasps, margin
 
 import jaxgrasp as jg
+from jaxgrasp.metrics.interior import contains_origin
 
 SAME = 1e-9
 SENT = re.compile(r"\b(all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter)")
@@ -50,6 +51,13 @@ def test_without_jit_and_inside_set_mesh():
         np.testing.assert_allclose(jax.vmap(margin)(spread), found, rtol=SAME)
     np.testing.assert_allclose(found, margin(contacts), rtol=SAME)
     np.testing.assert_allclose(turned, slope(contacts), rtol=SAME, atol=SAME)
+
+
+def test_closure_is_tested_on_each_device():
+    mesh = jax.make_mesh((2,), ("g",), axis_types=(AxisType.Auto,), devices=jax.devices("cpu")[:2])
+    wrenches = 0.1 * jax.random.normal(jax.random.key(0), (4, 12, 6))
+    on_each = jax.shard_map(jax.vmap(contains_origin), mesh=mesh, in_specs=P("g"), out_specs=P("g"))
+    np.testing.assert_array_equal(on_each(wrenches), jax.vmap(contains_origin)(wrenches))
 
 
 FIRST = """

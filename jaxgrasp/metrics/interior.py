@@ -51,5 +51,6 @@ def contains_origin(wrenches: jax.Array) -> jax.Array:
         sound = jnp.all(W @ new < 1)
         return jnp.where(sound, new, jnp.inf), jnp.where(sound, decrement, jnp.inf), steps + 1
 
-    start = (jnp.zeros(6, dtype), jnp.full((), jnp.inf, dtype), jnp.zeros((), jnp.int32))
+    # Like W also where it varies over devices.
+    start = (jnp.zeros_like(W[0]), jnp.full_like(W[0, 0], jnp.inf), jnp.zeros((), jnp.int32))
     return spans & (lax.while_loop(undecided, step, start)[1] < _DECREMENT)
