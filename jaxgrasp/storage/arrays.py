@@ -197,20 +197,17 @@ def read_array(path: Path | str) -> np.ndarray:
     """
     path, wanted = Path(path), "an intact .npy file of plain numbers"
     with open_regular(path, wanted) as stream:
-        try:
-            start = stream.read(_HEADER + 12)
-            if not start.startswith(_MAGIC):
-                raise FileError(path, None, "a file of another kind" if start else "an empty file", wanted)
-            header = _parsed(path, None, start)
-            _refuse_objects(path, None, header.dtype)
-            _check_cost(path, None, header.cost)
-            there = stream.seek(0, io.SEEK_END) - header.offset
-            if there < header.size:
-                raise FileError(path, None, f"{in_bytes(there)} of {in_bytes(header.size)} of data", wanted)
-            stream.seek(header.offset)
-            data = np.fromfile(stream, np.uint8, header.size)
-        except OSError as error:
-            raise FileError(path, None, reason_of(error), wanted) from error
+        start = stream.read(_HEADER + 12)
+        if not start.startswith(_MAGIC):
+            raise FileError(path, None, "a file of another kind" if start else "an empty file", wanted)
+        header = _parsed(path, None, start)
+        _refuse_objects(path, None, header.dtype)
+        _check_cost(path, None, header.cost)
+        there = stream.seek(0, io.SEEK_END) - header.offset
+        if there < header.size:
+            raise FileError(path, None, f"{in_bytes(there)} of {in_bytes(header.size)} of data", wanted)
+        stream.seek(header.offset)
+        data = np.fromfile(stream, np.uint8, header.size)
     return _array(path, None, header, data)
 
 

@@ -75,7 +75,10 @@ def open_regular(path: Path | str, wanted: str = "a regular file", cost: int = 1
     with stream:
         # The name may have come to mean another file since.
         _check(path, os.fstat(stream.fileno()), wanted, cost)
-        yield stream
+        try:
+            yield stream
+        except OSError as error:
+            raise FileError(path, None, reason_of(error), wanted) from error
 
 
 def reason_of(error: BaseException) -> str:
