@@ -83,7 +83,7 @@ def test_copies_do_not_count_as_failed_answers(monkeypatch):
     told = []
     flags = np.arange(8) % 2 == 0
     verdicts = Verdict(failed=flags, margin=np.zeros(8), upper_bound=np.zeros(8))
-    monkeypatch.setattr(auditing, "_verdicts", lambda *_: (verdicts, flags.sum()))
+    monkeypatch.setattr(auditing, "_JUDGES", dict.fromkeys(auditing._JUDGES, lambda *_: (verdicts, flags.sum())))
     monkeypatch.setattr(auditing, "_corrected", lambda kernel, out, verdicts: out)
     monkeypatch.setattr(auditing.setting, "report", lambda *counts: told.append(counts))
     auditing.audited(_LargestDisturbance(8, False), np.zeros(8), grasps(8), PUSHES, NOTHING, count=5)
