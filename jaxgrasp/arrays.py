@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgrasp import process
-from jaxgrasp.compiling import compiled
+from jaxgrasp.compiling import by_size, compiled
 
 
 def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | str, ...]) -> jax.Array:
@@ -90,7 +90,7 @@ def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
 
 
-@partial(compiled, pace=lambda: "soon")
+@partial(compiled, pace=by_size)
 def frames_from_normals(normals: jax.Array) -> jax.Array:
     """Contact frames (t1, t2, n) of unit normals: the x and y axes turned by the smallest rotation that takes z to n.
 

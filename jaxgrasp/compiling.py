@@ -18,6 +18,8 @@ _FAST = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512
 _BRIEF = _FAST | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 # Ready in half of that time again, and several times slower: for a few lanes.
 _SOON = _BRIEF | {"xla_backend_optimization_level": 0}
+# Numbers in arguments, for which the time to compile counts alone.
+_LITTLE = 1 << 14
 _PACES = {"fast": (_FAST,), "brief": (_BRIEF, _FAST), "soon": (_SOON, _FAST)}
 
 
@@ -29,7 +31,7 @@ def own_settings() -> Iterator[None]:
 
 
 def compiled(
-    function: Callable[..., Any], static_argnums: tuple[int, ...] = (), pace: Callable[[], str] = lambda: "fast"
+    function: Callable[..., Any], static_argnums: tuple[int, ...] = (), pace: Callable[..., str] = lambda *_: "fast"
 ) -> Callable[..., Any]:
     """`jax.jit` with the options that suit this library's kernels, where it is the outermost one.
 
@@ -38,7 +40,7 @@ def compiled(
     Args:
         function: to be compiled.
         static_argnums: as `jax.jit` takes them.
-        pace: what the next call should be compiled for, see `options`.
+        pace: what a call with these arguments should be compiled for, see `options`.
     """
     inner = jax.jit(function, static_argnums=static_argnums)
 
@@ -56,9 +58,14 @@ def compiled(
                 return inner(*args)
             # NaN and infinity are answers here.
             with jax.debug_nans(False), jax.debug_infs(False):
-                return outer(pace())(*args)
+                return outer(pace(*args))(*args)
 
     return call
+
+
+def by_size(*args: Any) -> str:
+    """The pace of programs that touch every number once."""
+    return "soon" if sum(jnp.size(x) for x in jax.tree.leaves(args)) <= _LITTLE else "brief"
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals, placed
-from jaxgrasp.compiling import compiled
+from jaxgrasp.compiling import by_size, compiled
 from jaxgrasp.direct import filled, is_direct, power_of_two
 from jaxgrasp.records import record
 
@@ -143,7 +143,7 @@ _FEW_NORMALS = 1024
 _EVENTS = {"positions": (3,), "frames": (3, 3), "friction": (), "max_force": (), "active": ()}
 
 
-@functools.partial(compiled, static_argnums=(0,), pace=lambda: "soon")
+@functools.partial(compiled, static_argnums=(0,), pace=by_size)
 def _spread(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.Array]:
     """The leaves in one precision and with all axes: one program, where each operation would be one by itself."""
     positions, frames = leaves[:2]

@@ -133,7 +133,7 @@ def over_grasps(
     return cut(audited(kernel, out, fill.contacts, disturbances, fill.given, count), count)
 
 
-@functools.partial(compiled, static_argnums=(0,), pace=lambda: "brief" if usable() else "fast")
+@functools.partial(compiled, static_argnums=(0,), pace=lambda *_: "brief" if usable() else "fast")
 def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Any:
     """Run the kernel over the lanes."""
     arguments = laid_out(contacts, disturbances, given)

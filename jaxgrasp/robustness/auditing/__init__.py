@@ -114,10 +114,12 @@ def _verdicts(
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), verdicts), failed
 
 
-_JUDGES = {pace: compiled(_verdicts, static_argnums=(0, 1), pace=lambda pace=pace: pace) for pace in ("brief", "soon")}
+_JUDGES = {
+    pace: compiled(_verdicts, static_argnums=(0, 1), pace=lambda *_, pace=pace: pace) for pace in ("brief", "soon")
+}
 
 
-@partial(compiled, static_argnums=(0,), pace=lambda: "soon")
+@partial(compiled, static_argnums=(0,), pace=lambda *_: "soon")
 def _corrected(kernel: Any, out: Tree, verdicts: Tree) -> Tree:
     return kernel.correct(out, verdicts)
 
