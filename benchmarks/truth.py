@@ -6,8 +6,8 @@ The lanes are of the 27 families of `suite/families.py`, one in eight spoilt. Ev
 without the spoilt lanes, by `largest_disturbance` and by `least_effort` at shares of the margin found (shares above one
 included). Rules are in `suite/rules.py`; lanes that their own forces and multipliers do not settle, and a random sample
 of the others, go to HiGHS. With --record every batch becomes a line of that file; batches that it has are not run
-again, and the report, truth.md beside this file, is of all its lines. The default form of the audit computes other lanes
-anew at each call, so that some lanes count as harmed; JAXGRASP_AUDIT=strict looks at all of them.
+again, and the report, truth.md beside this file, is of all its lines. The default form of the audit computes other
+lanes anew at each call, so that some lanes count as harmed; JAXGRASP_AUDIT=strict looks at all of them.
 """
 
 from __future__ import annotations
