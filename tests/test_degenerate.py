@@ -314,3 +314,17 @@ def test_no_grasp_is_left_without_an_answer_or_a_mark(hands, friction, max_force
             assert jg.Status(int(status[lane])).name == truth.status
             if solved[lane]:
                 assert abs(margin[lane] - truth.margin) <= TOLERANCE * max(abs(truth.margin), truth.scale)
+
+
+def test_jaws_in_a_plane_to_within_rounding_are_right_or_in_doubt():
+    """Normals that left their plane in float32: the rank is 5, or it is not told."""
+    rng = np.random.default_rng(0)
+    tilt = np.repeat([1e-10, 1e-9, 1e-8, 3e-8, 1e-7, 1e-6], 32)
+    turn = rng.uniform(0, 2 * np.pi, len(tilt))
+    normal = np.stack([np.cos(turn), np.sin(turn), tilt * rng.normal(size=len(tilt))], -1)
+    normals = np.stack([normal, -normal], 1) / np.linalg.norm(normal, axis=-1)[:, None, None]
+    contacts = jg.Contacts.from_normals(0.03 * normals, normals, friction=0.6, max_force=5.0)
+    with jg.audit("off"):
+        found = jg.largest_disturbance(contacts, jg.DisturbanceSet.forces(1.0))
+    solved = np.asarray(found.status == jg.Status.SOLVED)
+    assert solved.mean() > 0.4 and np.all(np.asarray(found.rank)[solved] == 5)

@@ -262,8 +262,14 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
     """
     ratios, kept = basis.ratios, basis.kept > 0
     if ratios.dtype == jnp.float64:
-        least = fold(jnp.minimum, jnp.where(kept, ratios, 1)[:6])
-        return fold(jnp.maximum, jnp.where(kept, 0, ratios)[:6]) > _TURNED * least
+        least = second = jnp.ones_like(ratios[0])
+        for ratio in jnp.where(kept, ratios, 1)[:6]:
+            least, second = jnp.minimum(least, ratio), jnp.minimum(second, jnp.maximum(least, ratio))
+        most = fold(jnp.maximum, jnp.where(kept, 0, ratios)[:6])
+        # Beside a short row, what is left of one that depends on it is eps over its length, which may be kept or not.
+        rounding = 16 * jnp.finfo(ratios.dtype).eps
+        told = (most * least <= rounding) & (least > 1e-8)
+        return (least * second <= rounding) | (most > _TURNED * least) & ~told
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
     doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
     doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)
