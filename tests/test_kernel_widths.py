@@ -30,7 +30,7 @@ NOISE = ("residual", "gap", "iterations", "multipliers")
 UNDECIDED = {"float64": 0.0, "float32": 0.005}
 """Share of lanes whose status rounding may change."""
 
-QUICK = [("plain", "float64", True), ("plain", "float32", False), ("gradients", "float64", False)]
+QUICK = [("plain", "float64", True), ("plain", "float32", False)]
 """Group, precision, and whether XLA is asked, too, which compiles for longer than all kernels together."""
 
 THOROUGH = [(group, dtype, True) for group in kernel_programs.GROUPS for dtype in TOLERANCE]
