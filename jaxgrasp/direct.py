@@ -15,7 +15,7 @@ Tree = Any
 
 
 def is_direct(leaves: Iterable[Any]) -> bool:
-    """Whether a call of these arrays is direct."""
+    """True if all arrays are on the default CPU, put there by JAX itself, and nothing traces the call."""
     if jax.default_backend() != "cpu" or not jax.sharding.get_abstract_mesh().empty:
         return False
     # Inside somebody's jit every operation gives a tracer, even one on constants.

@@ -120,9 +120,9 @@ def processor() -> str:
 HEAD = """# Whether answers are true
 
 `JAXGRASP_AUDIT=strict python -m benchmarks.truth --dtype float64 --lanes 4000000` and
-`--dtype float32 --lanes 1000000`, with one `--record`: lanes of the families in `benchmarks/suite/families.py`, one in
-eight spoilt, solved by `largest_disturbance` (21) and by `least_effort` (22) at 0 to 1.5 times the margin found. Two
-figures stand for (21) / (22).
+`--dtype float32 --lanes 1000000`, with `--seed 11` and one `--record`: lanes of the families in
+`benchmarks/suite/families.py`, one in eight spoilt, solved by `largest_disturbance` (21) and by `least_effort` (22) at
+0 to 1.5 times the margin found. Two figures stand for (21) / (22).
 
 - **Wrong**: SOLVED and, in float64 NumPy, G f misses b by more than 1e-7 (float32: 3e-5) of the larger of |b| and the
   sum of |f_i|, moments over the grasp's size; or a pyramid or bound row is exceeded, at the margin claimed or at the

@@ -155,7 +155,7 @@ def _spread(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.A
 
 
 def _spread_directly(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.Array]:
-    """The same, where nothing need be compiled."""
+    """`_spread` in NumPy, for direct calls: nothing is compiled."""
     positions, frames = leaves[:2]
     dtype, n_c = jnp.result_type(positions, frames), positions.shape[-2]
     return [

@@ -193,7 +193,7 @@ def _columns(
 def _uneven(
     data: memoryview, at: int, element: _Element, order: str
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
-    """The same where lists are of different lengths: of the lists alone."""
+    """An element's lists by name, where rows have lists of different lengths; other columns are passed over."""
     values = {p.name: bytearray() for p in element.properties if p.length}
     counts = {name: array("q") for name in values}
     sizes = [np.dtype(p.kind).itemsize for p in element.properties]

@@ -38,10 +38,10 @@ class Geometry(NamedTuple):
 
 
 class Engine(Protocol):
-    """What finds contacts; made of a scene, the bodies of hand and object, and the joints and actuators of the hand."""
+    """Finds contacts; made of a scene, the bodies of hand and object, and the joints and actuators of the hand."""
 
     differentiable: bool
-    """Whether what it finds has derivatives; stops of joints, whose torques jump, then do not count."""
+    """True if derivatives pass through `find`; stops of joints, whose torques jump, then do not count."""
 
     def find(self, qpos: Any) -> Geometry:
         """What is where in configurations (n, nq), which are finite."""

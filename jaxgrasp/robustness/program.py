@@ -253,7 +253,10 @@ def actuated_values(
 def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) -> jax.Array:
     """Where the rank cannot be told, or what is in the range, or rounding makes much of a short row.
 
-    What is dropped turns what is kept by its share of the shortest row that stays. float64 is fine enough for all else.
+    Dropping a row turns those that are kept by its length over that of the shortest one. Rows are taken in their order:
+    beside a short one, what is left of a row that depends on it is rounding, eps over the short one's length. So in
+    float64 the rank is in doubt where two rows are so short that one may be rounding, or where a dropped row that is
+    more than rounding turns the others by more than 1e-7.
 
     In float32 a row that is nearly dependent makes S_1 and S_2 wrong by eps over what was left of it. One that was
     dropped may be dependent or not, unless the contacts themselves say so: all on one line, to the last bit. A
@@ -266,10 +269,9 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
         for ratio in jnp.where(kept, ratios, 1)[:6]:
             least, second = jnp.minimum(least, ratio), jnp.minimum(second, jnp.maximum(least, ratio))
         most = fold(jnp.maximum, jnp.where(kept, 0, ratios)[:6])
-        # Beside a short row, what is left of one that depends on it is eps over its length, which may be kept or not.
         rounding = 16 * jnp.finfo(ratios.dtype).eps
-        told = (most * least <= rounding) & (least > 1e-8)
-        return (least * second <= rounding) | (most > _TURNED * least) & ~told
+        dependent = (most * least <= rounding) & (least > 1e-8)
+        return (least * second <= rounding) | (most > _TURNED * least) & ~dependent
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
     doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
     doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)
