@@ -63,7 +63,7 @@ def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
     A loop where fences are on, since code size is compile time there; else spelt out, for fusion.
     """
     if count == 1:
-        return step(jnp.zeros((), jnp.int32), state)
+        return step(jnp.asarray(0), state)
     return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() or _loops.get() else True)
 
 

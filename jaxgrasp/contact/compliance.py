@@ -65,14 +65,28 @@ class Basis(NamedTuple):
 def row_basis(rows: jax.Array) -> Basis:
     """Modified Gram-Schmidt of rows (r, k, n, *lanes).
 
-    Rows that end up shorter than the tolerance become zero, and their operations stay unscaled. One step of Newton and
-    Schulz then makes the basis orthonormal to rounding: it squares what close rows lost.
+    Of the three rows of moments, the longest that is left goes first: beside a short one, what is left of a row that
+    depends on it would be rounding divided by the short one's length. Rows that end up shorter than the tolerance
+    become zero, and their operations stay unscaled. One step of Newton and Schulz then makes the basis orthonormal to
+    rounding: it squares what close rows lost.
     """
     count, lanes = rows.shape[0], rows.shape[3:]
     index = jnp.arange(count).reshape(count, *[1] * len(lanes))
     eye = jnp.eye(count, dtype=rows.dtype).reshape(count, count, *[1] * len(lanes))
     longest = jnp.sqrt(fold(jnp.maximum, _dot(rows, rows)))
     least = RANK_TOLERANCE[rows.dtype.name] * longest
+
+    @fenced
+    def longest_first(rows: jax.Array, operations: jax.Array) -> tuple[jax.Array, jax.Array]:
+        squares = list(_dot(rows, rows))
+        for r in reversed(range(1, len(squares))):
+            longer = squares[r] > squares[r - 1]
+            squares[r - 1] = jnp.maximum(squares[r], squares[r - 1])
+            rows, operations = (
+                x.at[r - 1].set(jnp.where(longer, x[r], x[r - 1])).at[r].set(jnp.where(longer, x[r - 1], x[r]))
+                for x in (rows, operations)
+            )
+        return rows, operations
 
     @fenced
     def remove(j: jax.Array, rows: jax.Array, operations: jax.Array, products: jax.Array) -> tuple:
@@ -91,7 +105,13 @@ def row_basis(rows: jax.Array) -> Basis:
         return rows, operations, lengths.at[j].set(length)
 
     state = (rows, jnp.broadcast_to(eye, (count, count, *lanes)), jnp.zeros((count, *lanes), rows.dtype))
-    rows, operations, lengths = repeat(count, step, state)
+    state = repeat(3, step, state)
+    for j in (3, 4):
+        rows, operations, lengths = state
+        first = longest_first(rows[j:6], operations[j:6])
+        rows, operations = rows.at[j:6].set(first[0]), operations.at[j:6].set(first[1])
+        state = step(jnp.asarray(j), (rows, operations, lengths))
+    rows, operations, lengths = repeat(count - 5, lambda i, state: step(i + 5, state), state)
     kept = (lengths > least).astype(rows.dtype)
 
     @fenced
