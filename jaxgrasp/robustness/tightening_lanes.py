@@ -86,7 +86,9 @@ def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, It
     # The solver's own bound tells how far it came, the other one whether its rows were the right ones.
     came = jnp.where(jnp.isinf(low), 1, size)
     apart = lambda upper, unit: jnp.abs(upper - low) <= accepted * unit  # noqa: E731
-    closed = exact & apart(outcome.record.upper, came) & apart(high, _told(program.mean / program.scale, came))
+    hopeless = jnp.maximum(low, high) < -settings.tolerance
+    told = jnp.where(hopeless, came, _told(program.mean / program.scale, came))
+    closed = exact & apart(outcome.record.upper, came) & apart(high, told)
     # Where bounds cross, rounding made one of them false: less is attained in any case, and more is certain.
     low, high = jnp.minimum(low, high), jnp.maximum(low, high)
     record = outcome.record._replace(lower=low, upper=high, x=tuple(jnp.where(idle, 0, x) for x in point.x))
@@ -96,7 +98,6 @@ def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, It
     margin, upper = low * program.scale, high * program.scale
     margin = jnp.where(program.slippery, jnp.minimum(margin, 0), margin)
     upper = jnp.where(program.slippery, jnp.minimum(upper, 0), upper)
-    hopeless = high < -settings.tolerance
     upper = jnp.where(hopeless & jnp.isinf(low), 0, upper)
     margin = jnp.where(hopeless & ~closed | pruned & jnp.isinf(low), jnp.nan, margin)
     decided = [
@@ -150,7 +151,8 @@ def _told(strength: jax.Array, size: jax.Array) -> jax.Array:
     """What the accepted gap of proven bounds is a share of: the mean largest force, or the size of the margin.
 
     float32 proves bounds less closely than it finds margins, so there the smaller one counts, for disturbances of a
-    newton; of far weaker ones the margin is so large that nothing but its size can count.
+    newton; of far weaker ones the margin is so large that nothing but its size can count. Of loads that cannot be
+    borne the proof stands without the margin, whose size counts alone.
     """
     return jnp.maximum(strength, size) if strength.dtype == jnp.float64 else jnp.maximum(0.8 * strength, size / 8)
 
