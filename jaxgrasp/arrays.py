@@ -131,3 +131,10 @@ def fold(op: Callable[[jax.Array, jax.Array], jax.Array], parts: Iterable[jax.Ar
     while len(parts) > 1:
         parts = [op(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i] for i in range(0, len(parts), 2)]
     return parts[0]
+
+
+def fold_last(op: Callable[[jax.Array, jax.Array], jax.Array], x: jax.Array, axes: int = 1) -> jax.Array:
+    """`fold` along the last axes of x, which are short: XLA's CPU code then makes one loop of it and what is around."""
+    for _ in range(axes):
+        x = fold(op, [x[..., k] for k in range(x.shape[-1])])
+    return x

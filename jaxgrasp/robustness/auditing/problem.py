@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxgrasp.arrays import fold_last
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.robustness.arguments import Arguments
@@ -65,11 +66,11 @@ def problem_of(arguments: Arguments) -> Problem:
         present.reshape(*present.shape, *[1] * (leaves[name].ndim - 2)), leaves[name], other
     )
     positions, friction, max_force = here("positions", 0), here("friction", 0), here("max_force", 1)
-    count = jnp.maximum(present.sum(-1), 1).astype(positions.dtype)
+    count = jnp.maximum(fold_last(jnp.add, present.astype(positions.dtype)), 1)
     # In units of the largest, whose square may be more, or less, than there are numbers for.
-    largest = jnp.abs(positions).max((-2, -1))
+    largest = fold_last(jnp.maximum, jnp.abs(positions), 2)
     largest = jnp.where(largest > 0, largest, 1)
-    square = ((positions / largest[:, None, None]) ** 2).sum((-2, -1)) / count
+    square = fold_last(jnp.add, (positions / largest[:, None, None]) ** 2, 2) / count
     last = {name: jnp.moveaxis(x, 0, -1) for name, x in leaves.items() if name.startswith("term")}
     terms = arguments.terms(last)
     strongest = jnp.where(present, max_force, 0)

@@ -9,12 +9,13 @@ with rows A f + sigma lambda <= h, and |f_t| <= mu f_max, |f_n| <= f_max bound r
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxgrasp.arrays import fold
+from jaxgrasp.arrays import fold, fold_last
 from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import hidden
 from jaxgrasp.robustness.auditing.problem import Problem, facets, problem_of
@@ -28,6 +29,10 @@ MISSED = {"float64": 5e-8, "float32": 1.5e-5}
 CLOSED = {"float64": 2e-7, "float32": 2e-4}
 # Forces below this share of the largest are rounding.
 _NOTHING = {"float64": 1e-15, "float32": 1e-6}
+
+_sum, _max, _min, _all, _any = (
+    partial(fold_last, op) for op in (jnp.add, jnp.maximum, jnp.minimum, jnp.logical_and, jnp.logical_or)
+)
 
 
 class Evidence(NamedTuple):
@@ -76,13 +81,13 @@ def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Ar
     rows, place = own_rows(problem, solution.cone_multipliers.shape[-1], solution.rank)
     # What counts is what a row loses at the margin, or at the disturbance that takes a whole row by itself.
     force, there = problem.max_force, problem.present
-    taken = jnp.maximum(used.cone.max(-1) / jnp.where(problem.friction > 0, problem.friction, jnp.inf), used.bound)
-    taken = jnp.where(there, taken / force, 0).max(-1)
+    taken = jnp.maximum(_max(used.cone) / jnp.where(problem.friction > 0, problem.friction, jnp.inf), used.bound)
+    taken = _max(jnp.where(there, taken / force, 0))
     margin = jnp.where(jnp.isfinite(solution.margin), jnp.abs(solution.margin), 0)
     margin = jnp.maximum(margin, jnp.where(taken > 0, 1 / jnp.where(taken > 0, taken, 1), 0))[:, None]
     near = 4 * MISSED[margin.dtype.name]
-    apart = margin * jnp.maximum(jnp.abs(rows.cone - used.cone).max(-1), jnp.abs(rows.bound - used.bound))
-    right = ((apart <= near * force) | ~there).all(-1) & place.rank_stands
+    apart = margin * jnp.maximum(_max(jnp.abs(rows.cone - used.cone)), jnp.abs(rows.bound - used.bound))
+    right = _all((apart <= near * force) | ~there) & place.rank_stands
     if problem.hand is not None:
         right &= (margin * jnp.abs(rows.effort - used.effort).max(1) <= near * effort_unit(problem)).all(-1)
     # Where the set is said to reach outside, and neither multipliers nor contacts without friction bound the margin.
@@ -146,15 +151,15 @@ def _judged(
 def natural_scale(problem: Problem, rows: Rows) -> jax.Array:
     """The disturbance that takes a row of the mean force, (lanes,), 1 where nothing disturbs."""
     present = problem.present.astype(problem.max_force.dtype)
-    mean = (problem.max_force * present).sum(-1) / jnp.maximum(present.sum(-1), 1)
+    mean = _sum(problem.max_force * present) / jnp.maximum(_sum(present), 1)
     largest = rows_size(rows)
     return jnp.where(largest > 0, mean / jnp.where(largest > 0, largest, 1), 1)
 
 
 def rows_size(rows: Rows) -> jax.Array:
     """The most that any row loses, (lanes,)."""
-    most = jnp.maximum(rows.cone.max((-2, -1)), rows.bound.max(-1))
-    return most if rows.effort is None else jnp.maximum(most, rows.effort.max((-2, -1)))
+    most = jnp.maximum(_max(rows.cone, 2), _max(rows.bound))
+    return most if rows.effort is None else jnp.maximum(most, _max(rows.effort, 2))
 
 
 def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array, jax.Array]:
@@ -179,13 +184,14 @@ def _most(spare: jax.Array, loss: jax.Array) -> jax.Array:
     """The largest lambda with lambda loss <= spare in every row, (lanes,)."""
     moved = loss > 0
     still = jnp.where(spare >= 0, jnp.inf, -jnp.inf)
-    return jnp.where(moved, spare / jnp.where(moved, loss, 1), still).min(tuple(range(1, loss.ndim)))
+    return _min(jnp.where(moved, spare / jnp.where(moved, loss, 1), still), loss.ndim - 1)
 
 
 def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[jax.Array, jax.Array]:
     """C f (lanes, n, n_e) and -f_n (lanes, n)."""
     pressed = jnp.stack([forces[..., 0], forces[..., 1], problem.friction * forces[..., 2]], -1)
-    cone = jnp.einsum("...a,ka->...k", pressed, facets(cone_edges, forces.dtype), precision="highest")
+    pattern = facets(cone_edges, forces.dtype)
+    cone = fold(jnp.add, [pressed[..., a, None] * pattern[:, a] for a in range(3)])
     return cone, -forces[..., 2]
 
 
@@ -195,18 +201,15 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
     pushes = frames[..., 0] * f[..., :1] + frames[..., 1] * f[..., 1:2] + frames[..., 2] * f[..., 2:]
     size = problem.size[:, None]
     wanted = problem.wrench if wrench is None else wrench
+    moments = fold(jnp.add, jnp.moveaxis(cross(problem.positions, pushes, -1), 1, 0))
     missing = jnp.concatenate(
-        [
-            pushes.sum(1) - wanted[:, :3],
-            (cross(problem.positions, pushes, -1).sum(1) - wanted[:, 3:]) / size,
-        ],
-        -1,
+        [fold(jnp.add, jnp.moveaxis(pushes, 1, 0)) - wanted[:, :3], (moments - wanted[:, 3:]) / size], -1
     )
-    largest = jnp.maximum(jnp.abs(wanted[:, :3]).max(-1), jnp.abs(wanted[:, 3:] / size).max(-1))
+    largest = jnp.maximum(_max(jnp.abs(wanted[:, :3])), _max(jnp.abs(wanted[:, 3:] / size)))
     # Forces that are nothing but rounding are none.
-    largest = jnp.maximum(largest, jnp.sqrt((f * f).sum(-1)).sum(-1))
-    largest = jnp.maximum(largest, _NOTHING[f.dtype.name] * jnp.where(problem.present, problem.max_force, 0).max(-1))
-    return jnp.abs(missing).max(-1) <= MISSED[f.dtype.name] * largest
+    largest = jnp.maximum(largest, _sum(jnp.sqrt(_sum(f * f))))
+    largest = jnp.maximum(largest, _NOTHING[f.dtype.name] * _max(jnp.where(problem.present, problem.max_force, 0)))
+    return _max(jnp.abs(missing)) <= MISSED[f.dtype.name] * largest
 
 
 def effort_unit(problem: Problem) -> jax.Array:
@@ -229,7 +232,7 @@ def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -
     """A'z + G'y, (lanes, n, 3), and the sum of the cone rows' multipliers of every contact, (lanes, n)."""
     patterns = facets(cone.shape[-1], cone.dtype)
     patterns = jnp.concatenate([patterns, jnp.ones_like(patterns[:, :1])], 1)
-    pull = jnp.einsum("...k,ka->...a", cone, patterns, precision="highest")
+    pull = fold(jnp.add, [cone[..., k, None] * patterns[k] for k in range(cone.shape[-1])])
     turned = y[:, None, :3] + cross(jnp.broadcast_to(y[:, None, 3:], problem.positions.shape), problem.positions, -1)
     frames = problem.frames
     along = frames[:, :, 0] * turned[..., :1] + frames[:, :, 1] * turned[..., 1:2] + frames[:, :, 2] * turned[..., 2:]
@@ -248,15 +251,15 @@ def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.
     """The bound that the multipliers prove, inf where none, and whether they prove that b cannot be borne; (lanes,)."""
     cone, bound, y = evidence.cone_multipliers, evidence.bound_multipliers, evidence.wrench_multipliers
     residual, total = _pulled(problem, cone, bound, y)
-    pull = (cone * rows.cone).sum((-2, -1)) + (bound * rows.bound).sum(-1)
-    sound = (cone.min((-2, -1)) >= 0) & (bound.min(-1) >= 0)
-    value, more = (problem.wrench * y).sum(-1), 0.0
+    pull = _sum(cone * rows.cone, 2) + _sum(bound * rows.bound)
+    sound = (_min(cone, 2) >= 0) & (_min(bound) >= 0)
+    value, more = _sum(problem.wrench * y), 0.0
     if problem.hand is not None:
         more, held, spent = _of_efforts(problem, evidence, rows)
         pull, value = pull + held[0], value + held[1] + spent
-        sound &= evidence.actuator_multipliers.min((-2, -1)) >= 0
+        sound &= _min(evidence.actuator_multipliers, 2) >= 0
     each = bound * problem.max_force - total * problem.reserve[:, None] + _lost(problem, residual + more)
-    value = value + jnp.where(problem.present, each, 0).sum(-1)
+    value = value + _sum(jnp.where(problem.present, each, 0))
     bound = jnp.where(sound & (pull > 0), value / jnp.where(pull > 0, pull, 1), jnp.inf)
     return bound, sound & (value < 0)
 
@@ -284,8 +287,8 @@ def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None)
 
 def _slips(problem: Problem, rows: Rows) -> jax.Array:
     """Where a contact without friction would have to bear a tangential force, (lanes,)."""
-    loses = rows.cone.max(-1) > 1e-9 * rows_size(rows)[:, None]
-    return ((problem.friction <= 0) & problem.present & loses).any(-1)
+    loses = _max(rows.cone) > 1e-9 * rows_size(rows)[:, None]
+    return _any((problem.friction <= 0) & problem.present & loses)
 
 
 def _claims_flat(solution: Solution) -> jax.Array:
@@ -295,7 +298,7 @@ def _claims_flat(solution: Solution) -> jax.Array:
 
 def _outside(problem: Problem, solution: Solution, place: Range | None) -> jax.Array:
     """Where b lies outside the range of G, or of what G has left where contacts have no friction, (lanes,)."""
-    slippery = ((problem.friction < 1e-6) & problem.present).any(-1)
+    slippery = _any((problem.friction < 1e-6) & problem.present)
     return slippery | (solution.rank < 6 if place is None else place.wrench_outside & place.rank_stands)
 
 
@@ -306,26 +309,26 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     """
     dtype, there, forces, asked = solution.forces.dtype.name, problem.present, solution.forces, problem.margin
     cone, bound, y = solution.cone_multipliers, solution.bound_multipliers, solution.wrench_multipliers
-    sound = (cone.min((-2, -1)) >= 0) & (bound.min(-1) >= 0)
+    sound = (_min(cone, 2) >= 0) & (_min(bound) >= 0)
     residual, total = _pulled(problem, cone, bound, y)
     held = bound * problem.max_force - total * problem.reserve[:, None]
-    held = jnp.where(there, held, 0).sum(-1) + (problem.wrench * y).sum(-1)
-    held -= asked * ((cone * rows.cone).sum((-2, -1)) + (bound * rows.bound).sum(-1))
+    held = _sum(jnp.where(there, held, 0)) + _sum(problem.wrench * y)
+    held -= asked * (_sum(cone * rows.cone, 2) + _sum(bound * rows.bound))
     if problem.hand is not None:
         more, (pull, value), spent = _of_efforts(problem, solution, rows)
         residual, held = residual + more, held + value + spent - pull * asked
-        sound &= solution.actuator_multipliers.min((-2, -1)) >= 0
+        sound &= _min(solution.actuator_multipliers, 2) >= 0
     if problem.weights is None:
         largest, weighed, answered = 1.0, forces, residual
     else:
         weights = jnp.where(there[:, :, None, None], problem.weights, jnp.eye(3, dtype=forces.dtype))
-        largest = jnp.abs(weights).max((-2, -1))
+        largest = _max(jnp.abs(weights), 2)
         weighed, answered = jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
-    own = 0.5 * (forces * weighed).sum(-1)
+    own = 0.5 * _sum(forces * weighed)
     # Of every contact the better of two bounds: without its limits, and by the tangent at f_0 within them.
-    least = jnp.maximum(-0.5 * (residual * answered).sum(-1), -own - _lost(problem, weighed + residual))
-    effort, lower = (jnp.where(there, part, 0).sum(-1) for part in (own, least))
-    unit = jnp.where(there, largest * problem.max_force**2, 0).max(-1)
+    least = jnp.maximum(-0.5 * _sum(residual * answered), -own - _lost(problem, weighed + residual))
+    effort, lower = (_sum(jnp.where(there, part, 0)) for part in (own, least))
+    unit = _max(jnp.where(there, largest * problem.max_force**2, 0))
     near = CLOSED[dtype] * jnp.maximum(effort, 1e-3 * unit)
     return sound & (effort - (lower - held) <= near) & (jnp.abs(effort - solution.effort) <= near)
 

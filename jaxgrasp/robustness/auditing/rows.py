@@ -7,7 +7,6 @@ divided by the grasp's size) are made orthonormal by Gram-Schmidt with row pivot
 """
 
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
+from jaxgrasp.fence import fenced, fences
 from jaxgrasp.robustness.auditing.problem import Problem, facets
 
 # Shares of the longest row between which a row may count as independent or not: there the solver's word is taken.
@@ -59,12 +60,18 @@ class Echelon(NamedTuple):
 
 def own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, Range]:
     """S_1, S_2, and where b and the set lie, with the rank (lanes,) of G that the solver claims."""
-    rows = _stacked_rows(problem)
+    with fences(jax.default_backend() == "cpu"):
+        return _own_rows(problem, cone_edges, rank)
+
+
+def _own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, Range]:
+    rows = fenced(_stacked_rows)(problem)
     # Where rows of the joints stand below those of G the solver does not tell their rank.
     rank = rank if rows.shape[0] == 6 else None
     plain = echelon(rows, rank)
     if problem.per_vertex is None:
-        found = _reached(problem, _weighted(rows, problem, problem.compliance, rank, plain), cone_edges)
+        inverse = _weighted(rows, problem, problem.compliance, rank, plain)
+        found = fenced(lambda problem, inverse: _reached(problem, inverse, cone_edges))(problem, inverse)
     else:
 
         def answered(vertex: tuple) -> Rows:
@@ -74,7 +81,7 @@ def own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, 
 
         vertices = (jnp.moveaxis(problem.per_vertex, 1, 0), problem.terms[0].wrenches)
         found = jax.tree.map(lambda x: jnp.maximum(x.max(0), 0), lax.map(answered, vertices))
-    return found, _range(problem, plain)
+    return found, fenced(_range)(problem, plain)
 
 
 def own_inverse(problem: Problem) -> jax.Array:
@@ -112,36 +119,55 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
     """
     count, width, lanes = rows.shape
     dtype = rows.dtype
-    product = partial(jnp.einsum, precision="highest")
-    squares = lambda x: product("...k,...k->...", x[..., :width], x[..., :width])  # noqa: E731
-    # The rows and, beside them, the row operations that led to them: small products are fast with lanes leading.
-    rows = jnp.moveaxis(rows, -1, 0)
-    # Made of the rows, so that they vary, and are divided, over the same axes of a mesh.
-    none = rows[:, :, :1] * 0
-    nothing = jnp.broadcast_to(none, (lanes, count, count))
-    left = (none[:, :, 0] == 0) | True
-    rows = jnp.concatenate([rows, nothing + jnp.eye(count, dtype=dtype)], 2)
-    longest = jnp.sqrt(squares(rows).max(1))
+    longest = jnp.sqrt(fold(jnp.maximum, _products(rows, rows)))
     least, most = (share * longest for share in _DOUBTFUL[dtype.name])
+    # Made of the rows, so that they vary, and are divided, over the same axes of a mesh.
+    none = rows[:, :1] * 0
+    left, stands = (none[:, 0] == 0) | True, (none[0, 0] == 0) | True
+    # The rows and, beside them, the row operations that led to them; a row that is done is a unit vector, or zero.
+    rows = jnp.concatenate([rows, none + jnp.eye(count, dtype=dtype)[:, :, None]], 1)
+
+    @fenced
+    def chosen(rows: jax.Array, left: jax.Array, squares: jax.Array) -> tuple:
+        pivot = jnp.argmax(jnp.where(left, squares, -1), 0) == jnp.arange(count)[:, None]
+        return pivot, fold(jnp.add, jnp.where(pivot[:, None], rows, 0))
+
+    @fenced
+    def remainder(rows: jax.Array, row: jax.Array, shares: jax.Array) -> jax.Array:
+        return row - fold(jnp.add, shares[:, None] * rows)
+
+    @fenced
+    def scaled(row: jax.Array, length: jax.Array, kept: jax.Array) -> jax.Array:
+        inverse = jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)
+        return jnp.concatenate([row[:width] * inverse, row[width:] * jnp.where(kept, inverse, 1)])
+
+    @fenced
+    def without(rows: jax.Array, unit: jax.Array, shares: jax.Array, pivot: jax.Array) -> jax.Array:
+        return jnp.where(pivot[:, None], unit, rows - shares[:, None] * unit)
+
+    products = fenced(lambda rows, row: _products(rows[:, :width], row[..., :width, :]))
 
     def step(j: jax.Array, state: tuple) -> tuple:
-        rows, basis, null, left, stands = state
-        pivot = jnp.argmax(jnp.where(left, squares(rows), -1), 1)[:, None] == jnp.arange(count)
-        row = product("lr,lrk->lk", pivot.astype(dtype), rows)
-        again = product("lrk,lk->lr", basis[..., :width], row[:, :width])
-        row = row - product("lr,lrk->lk", again, basis)
-        length = jnp.sqrt(squares(row))
+        rows, left, done, stands = state
+        pivot, row = chosen(rows, left, products(rows, rows))
+        row = remainder(rows, row, jnp.where(left, 0, products(rows, row)))
+        length = fenced(lambda row: jnp.sqrt(fold(jnp.add, row[:width] ** 2)))(row)
         kept = length > RANK_TOLERANCE[dtype.name] * longest if rank is None else j < rank
         stands &= jnp.where(kept, length > least, length <= most)
-        unit = row * jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)[:, None]
-        share = product("lrk,lk->lr", rows[..., :width], unit[:, :width])
-        basis = lax.dynamic_update_index_in_dim(basis, unit[:, None], j, 1)
-        null = lax.dynamic_update_index_in_dim(null, jnp.where(kept[:, None], 0, row[:, width:])[:, None], j, 1)
-        return rows - share[:, :, None] * unit[:, None], basis, null, left & ~pivot, stands
+        unit = scaled(row, length, kept)
+        left &= ~pivot
+        rows = without(rows, unit, jnp.where(left, products(rows, unit), 0), pivot)
+        return rows, left, done | pivot & kept, stands
 
-    _, basis, null, _, stands = lax.fori_loop(0, count, step, (rows, jnp.zeros_like(rows), nothing, left, left[:, 0]))
-    inverse = product("ljk,ljr->krl", basis[..., :width], basis[..., width:])
-    return Echelon(inverse, jnp.moveaxis(null, 0, -1), stands | (rank is None))
+    rows, _, kept, stands = lax.fori_loop(0, count, step, (rows, left, ~left, stands))
+    units, operations = rows[:, :width], rows[:, width:]
+    inverse = fenced(lambda a, b: fold(jnp.add, a[:, :, None] * b[:, None]))(units, operations)
+    return Echelon(inverse, jnp.where(kept[:, None], 0, operations), stands | (rank is None))
+
+
+def _products(rows: jax.Array, row: jax.Array) -> jax.Array:
+    """Inner products of rows (r, k, lanes) with one (k, lanes), or with as many; (r, lanes)."""
+    return fold(jnp.add, jnp.moveaxis(rows * row, 1, 0))
 
 
 def _weighted(
