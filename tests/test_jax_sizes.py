@@ -46,12 +46,12 @@ def test_answers_are_those_of_the_batch_itself():
 def test_which_batches_are_filled():
     contacts, loads = grasps(13), jnp.zeros((13, 6))
     fill = known_size(contacts, required_wrench=loads, margin=jnp.ones(()))
-    assert fill.count == 13 and fill.contacts.batch_shape == (16,) and fill.given["margin"].shape == ()
-    np.testing.assert_array_equal(fill.contacts.positions[13:], jnp.stack([contacts.positions[12]] * 3))
-    np.testing.assert_array_equal(fill.given["required_wrench"].shape, (16, 6))
+    assert fill.count == 13 and fill.contacts.batch_shape == (32,) and fill.given["margin"].shape == ()
+    np.testing.assert_array_equal(fill.contacts.positions[13:], jnp.stack([contacts.positions[12]] * 19))
+    np.testing.assert_array_equal(fill.given["required_wrench"].shape, (32, 6))
     # Sizes that have programs, other axes, and what is not a direct call.
     other_axes = jax.tree.map(lambda x: x[None], contacts)
-    assert known_size(grasps(16)) is None and known_size(grasps(1)) is None and known_size(other_axes) is None
+    assert known_size(grasps(32)) is None and known_size(grasps(1)) is None and known_size(other_axes) is None
     assert known_size(contacts, required_wrench=loads[:1]) is None
     # What does not fit is told of with its own shape.
     assert known_size(replace(contacts, frames=contacts.frames[:12])) is None
@@ -67,16 +67,18 @@ def test_each_grasp_with_its_own_actuation():
     contacts = grasps(13)
     hand = jg.Actuation.from_jacobian(jnp.ones((13, 4, 3, 2)), np.eye(2), -np.ones((13, 2)), np.ones(2))
     fill = known_size(contacts, actuation=hand).given["actuation"]
-    assert fill.jacobian.shape == (16, 4, 3, 2) and fill.lower.shape == (16, 2)
+    assert fill.jacobian.shape == (32, 4, 3, 2) and fill.lower.shape == (32, 2)
     assert fill.upper.shape == (2,) and fill.transmission.shape == (2, 2)
     short = replace(hand, jacobian=hand.jacobian[:, :3])
     assert known_size(contacts, actuation=short) is None
 
 
-def test_the_first_sizes_have_their_own(monkeypatch):
-    monkeypatch.setattr(sizes, "_OWN", 2)
-    filled = [known_size(grasps(count)) for count in (13, 21, 13, 64, 35, 21)]
-    assert [fill and fill.contacts.batch_shape for fill in filled] == [None, None, None, None, (64,), None]
+def test_the_first_large_size_has_its_own(monkeypatch):
+    monkeypatch.setattr(sizes, "_OWN", 1)
+    filled = [known_size(grasps(count)) for count in (13, 700, 21, 900, 700, 64, 3000)]
+    assert [fill and fill.contacts.batch_shape for fill in filled] == [
+        *((32,), None, (32,), (2048,), None, (128,), (4096,))
+    ]
 
 
 def test_copies_do_not_count_as_failed_answers(monkeypatch):

@@ -1,7 +1,8 @@
 """Direct calls on batches of many sizes, by few programs.
 
-XLA takes seconds, and keeps megabytes, for the programs of a size. The first sizes that come, and powers of two, have
-their own; other batches are filled up to the next power of two with copies of their last grasp, and answers are cut.
+XLA takes seconds, and keeps megabytes, for the programs of a size. So batches are filled with copies of their last
+grasp up to one of few sizes, and answers are cut: powers of four up to 2,048, where that costs a millisecond or two,
+then powers of two. The first large size that comes has programs of its own.
 """
 
 from collections.abc import Hashable
@@ -16,11 +17,11 @@ from jaxgrasp.direct import filled, is_direct, power_of_two
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.arguments import ACTUATION_EVENTS
 
-# How many sizes of a function and its shapes have programs of their own, beside powers of two.
-_OWN = 2
-# Smaller batches are filled up to the least, where time does not grow yet; filling larger ones costs more than it
-# saves.
-_LEAST, _LARGEST = 8, 1 << 16
+# How many sizes above the small ones have programs of their own, for a function and its shapes.
+_OWN = 1
+_SMALL = (8, 32, 128, 512, 2048)
+# Filling larger batches costs more than it saves.
+_LARGEST = 1 << 16
 # Arguments that are more than an array.
 _TREES = {"compliance", "actuation"}
 
@@ -47,7 +48,7 @@ def with_a_known_size(kernel: Hashable, contacts: Contacts, disturbances: Distur
     if len(contacts.batch_shape) != 1 or disturbances.batch_shape or given["compliance"] is not None:
         return None
     (count,) = contacts.batch_shape
-    if not isinstance(count, int) or not 1 < count <= _LARGEST or power_of_two(count, _LEAST) == count:
+    if not isinstance(count, int) or not 1 < count <= _LARGEST or _next(count) == count:
         return None
     leaves, structure = jax.tree.flatten((contacts, disturbances, given))
     if not is_direct(leaves) or any(x.shape[:1] != (count,) for x in jax.tree.leaves(contacts)):
@@ -73,9 +74,14 @@ class _OtherAxes(Exception):
 
 def _size(kind: Hashable, count: int) -> int:
     own = _known.setdefault(kind, set())
-    if len(own) < _OWN:
+    if len(own) < _OWN and count > _SMALL[-2]:
         own.add(count)
-    return count if count in own else power_of_two(count, _LEAST)
+    return count if count in own else _next(count)
+
+
+def _next(count: int) -> int:
+    """The smallest size with programs that is not below the count."""
+    return next((size for size in _SMALL if size >= count), power_of_two(count, 1))
 
 
 def _spread(value: jax.Array | None, event: tuple[int, ...], count: int, size: int) -> jax.Array | None:
