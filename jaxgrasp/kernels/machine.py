@@ -148,14 +148,14 @@ def capsule(address: int) -> Any:
 
 
 def cached(key: str) -> bytes | None:
-    """What was kept, if it is whole; what others could have written is not trusted."""
+    """What was kept under this key, if it is whole; what others could have written is not trusted."""
     try:
         with open_regular(cache_folder("kernels") / key) as stream:
             content = stream.read()
     except (OSError, FileError):
         return None
     digest, rest = content[:32], content[32:]
-    return rest if hashlib.sha256(rest).digest() == digest else None
+    return rest if _digest(key, rest) == digest else None
 
 
 def keep(key: str, content: bytes) -> None:
@@ -165,4 +165,8 @@ def keep(key: str, content: bytes) -> None:
         OSError: the folder cannot be written, or others could write to it.
     """
     with atomic_write(cache_folder("kernels") / key) as file:
-        file.write(hashlib.sha256(content).digest() + content)
+        file.write(_digest(key, content) + content)
+
+
+def _digest(key: str, content: bytes) -> bytes:
+    return hashlib.sha256(key.encode() + b"\n" + content).digest()
