@@ -88,8 +88,9 @@ def verdict(grasps: Grasps, shared: Basics, scale: jax.Array, form: Formulation,
     accepted = ACCEPTED[scale.dtype.name]
     value, bound = jnp.minimum(out.point.margin, out.upper), out.upper
     solved = (out.error <= accepted) & ~out.infeasible
-    # What is zero to the tolerance is zero.
-    value = jnp.where(solved & (jnp.abs(value) <= accepted), jnp.maximum(value, 0), value)
+    # What is zero to the tolerance is zero; without a load exactly, by no forces at all.
+    zero = jnp.where(_unloaded(grasps), 0, jnp.maximum(value, 0))
+    value = jnp.where(solved & (jnp.abs(value) <= accepted), zero, value)
     hopeless = out.infeasible | (solved & (value < 0)) | (bound < -accepted)
     infeasible, unknown = _feasibility(shared, form, solved | hopeless, hopeless)
 
@@ -119,6 +120,8 @@ def formulation_answer(
     upper = jnp.maximum(jnp.min(upper, 0), margin)
     program = worst if scale.shape[0] > 1 else jnp.zeros_like(worst)
     forces, disturbed = _forces(shared, form, out.point.x, directions, margin, program)
+    nothing = _unloaded(grasps) & (margin == 0)
+    forces, disturbed = (jnp.where(nothing, 0, x) for x in (forces, disturbed))
     finite = answered & shared.disturbed.any(0) & ~shared.outside.any(0)
     direction, contact, row = _binding(shared, rows, form, out.point.z, program)
     told = lambda v: jnp.where(finite, v, -1).astype(jnp.int32)  # noqa: E731
@@ -136,6 +139,10 @@ def formulation_answer(
         primal_residual=hide(jnp.max(jnp.where(out.iterations > 0, out.residual, 0), 0)),
         gap=hide(jnp.where(finite, (upper - margin) / jnp.maximum(_pick(scale, program), margin), 0)),
     )
+
+
+def _unloaded(grasps: Grasps) -> jax.Array:
+    return (grasps.wrench == 0).all(0)
 
 
 def _feasibility(
