@@ -1,5 +1,7 @@
 """Every command where it finds less than it is used to: it works, or says why not in one line.
 
+"says 2" counts the lines on standard error of a command that works: what it took for granted, and what it lacks.
+
 Python's own files have to be readable for whoever it runs as; as root, `nobody` is given the capability to read.
 
     python -m benchmarks.assaults.environments [--output environments.md]
@@ -87,14 +89,14 @@ def outcome(arguments: list[str], given: Environment, home: Path) -> str:
         timeout=600,
     )
     said = process.stderr.decode("utf-8", "replace")
-    if process.returncode in (0, 2) and said.count("\n") <= 1 and (not said or said.startswith("jaxgrasp: ")):
-        if process.returncode == 2 and not said and ">&-" not in given.after:
-            return "**silent exit 2**"
-        return {0: "works", 2: "one line, exit 2"}[process.returncode] + (
-            ", one line" if said and not process.returncode else ""
-        )
+    lines = said.splitlines()
+    if all(line.startswith("jaxgrasp: ") for line in lines):
+        if process.returncode == 0:
+            return f"works, says {len(lines)}" if lines else "works"
+        if process.returncode == 2 and (lines or ">&-" in given.after):
+            return f"exit 2, says {len(lines)}"
     print(given.name, arguments, process.returncode, said[-2000:], file=sys.stderr, flush=True)
-    return f"**exit {process.returncode}, {said.count(chr(10))} lines**"
+    return f"**exit {process.returncode}, {len(lines)} lines**"
 
 
 def main() -> None:
