@@ -28,7 +28,7 @@ from jaxgrasp.hands.bodies import (
     read_model,
     wrench_against_weight,
 )
-from jaxgrasp.hands.contact_parameters import hand_object_pairs
+from jaxgrasp.hands.contact_parameters import hand_object_pairs, warn_of_simplifications
 from jaxgrasp.hands.couplings import Couplings, read_couplings
 from jaxgrasp.hands.distance_engine import DistanceEngine
 from jaxgrasp.hands.engines import Engine, engine_for
@@ -98,8 +98,8 @@ class HandObject:
                 Grasps in files stand some millimetres off the surface.
             points_per_link: 1 makes one contact of each link, at the mean of its points that touch; more are as many
                 points of each link, spread apart; None makes every point a contact.
-            max_contacts: Of how many links a grasp keeps the contacts, the nearest ones (where every point is a
-                contact: how many points); None is all.
+            max_contacts: Of how many links a grasp keeps the contacts, the nearest ones; where every point is a
+                contact, how many points, of all links in turn. None is all.
             max_force: Largest normal force of every contact, N.
             friction: Coulomb's coefficient for all contacts; None is what MuJoCo makes of the geoms'.
             unreached: What joint directions do that neither an actuator nor a friction, a stop or a spring of a joint
@@ -134,9 +134,8 @@ class HandObject:
             raise ValueError(f"scene: joint {model.joint(joint).name!r} is a ball; wanted hinges and slides")
         joints = joints[np.isin(model.jnt_type[joints], (HINGE, SLIDE))]
         dofs = model.jnt_dofadr[joints]
-        pairs = hand_object_pairs(model, hand, of_object)
+        warn_of_simplifications(model, pairs := hand_object_pairs(model, hand, of_object))
         couplings, actuators = read_couplings(model, dofs), read_actuators(model, dofs)
-        passive = read_passive(model, joints)
         return cls(
             model=model,
             object_body=body,
@@ -150,7 +149,7 @@ class HandObject:
             couplings=couplings,
             touching_links=np.unique(model.geom_bodyid[[geom for geom, _ in pairs]]),
             _actuators=actuators,
-            _mechanics=Mechanics(model, joints, couplings, actuators, passive, unreached),
+            _mechanics=Mechanics(model, joints, couplings, actuators, read_passive(model, joints), unreached),
         )
 
     @property
