@@ -193,7 +193,7 @@ class GivenScene(HandScene):
         points, forces = (np.asarray(x) for x in grasps.in_world_frame(forces))
         titles = [f"#{b + 1}: margin {ranking.margin[row]:.3g} {unit}" for b, row in zip(best, rows, strict=True)]
         try:
-            draw_scenes(path, hand.model, qpos, points, forces, titles)
+            draw_scenes(path, hand.model, qpos, points, forces, titles, hand.object_body)
         except RuntimeError as error:
             raise OSError(str(error)) from error
 

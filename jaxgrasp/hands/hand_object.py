@@ -29,7 +29,7 @@ from jaxgrasp.hands.bodies import (
     wrench_against_weight,
 )
 from jaxgrasp.hands.contact_parameters import hand_object_pairs, warn_of_simplifications
-from jaxgrasp.hands.couplings import Couplings, read_couplings
+from jaxgrasp.hands.couplings import Couplings, held_by_welds, read_couplings
 from jaxgrasp.hands.distance_engine import DistanceEngine
 from jaxgrasp.hands.engines import Engine, engine_for
 from jaxgrasp.hands.grasps import HandGrasps
@@ -55,7 +55,7 @@ class HandObject:
     bodies: np.ndarray
     """The hand's bodies."""
     joints: np.ndarray
-    """The hand's joints, hinges and slides; free joints count as held where they are."""
+    """The hand's joints, hinges and slides; free and welded ones count as held where they are."""
     dofs: np.ndarray
     """Their degrees of freedom."""
     contact_distance: float
@@ -132,7 +132,7 @@ class HandObject:
         joints = np.flatnonzero(np.isin(model.jnt_bodyid, hand))
         for joint in joints[model.jnt_type[joints] == BALL]:
             raise ValueError(f"scene: joint {model.joint(joint).name!r} is a ball; wanted hinges and slides")
-        joints = joints[np.isin(model.jnt_type[joints], (HINGE, SLIDE))]
+        joints = joints[np.isin(model.jnt_type[joints], (HINGE, SLIDE)) & ~np.isin(joints, held_by_welds(model))]
         dofs = model.jnt_dofadr[joints]
         warn_of_simplifications(model, pairs := hand_object_pairs(model, hand, of_object))
         couplings, actuators = read_couplings(model, dofs), read_actuators(model, dofs)
