@@ -8,7 +8,7 @@ import pytest
 from test_passive import PUSHES, closed, four_pads, independent_margin, ranked
 
 import jaxgrasp as jg
-from jaxgrasp.hands import HandObject
+from jaxgrasp.hands import HandObject, Scene
 
 COUPLED = {
     "linear": '<equality><joint joint1="j1" joint2="j0" polycoef="0 1 0 0 0"/></equality>',
@@ -66,6 +66,30 @@ def test_a_gripper_whose_slides_are_coupled():
     # The actuator gives what all four pads press with.
     assert float(least.actuator_efforts[0]) == pytest.approx(18.097, abs=1e-2)
     np.testing.assert_allclose(-least.forces[:, 2].sum(), least.actuator_efforts[0], rtol=1e-6)
+
+
+MIMIC = """<robot name="gripper"><link name="palm"/>{links}
+<joint name="left" type="prismatic"><parent link="palm"/><child link="l"/><origin xyz="0 .04 0"/><axis xyz="0 -1 0"/>
+<limit lower="0" upper=".04" effort="20" velocity="1"/></joint>
+<joint name="right" type="prismatic"><parent link="palm"/><child link="r"/><origin xyz="0 -.04 0"/><axis xyz="0 1 0"/>
+<limit lower="0" upper=".04" effort="20" velocity="1"/><mimic joint="left" multiplier="{multiplier}"/>
+</joint></robot>"""
+JAW = """<link name="{}"><collision><geometry><box size=".02 .02 .04"/></geometry></collision><inertial>
+<mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+@pytest.mark.parametrize("multiplier", [1.0, 0.5])
+def test_joints_of_urdf_mimic_others(multiplier, tmp_path):
+    file = tmp_path / "gripper.urdf"
+    file.write_text(MIMIC.format(links=JAW.format("l") + JAW.format("r"), multiplier=multiplier))
+    scene = Scene.build(hand=file, object="sphere", scale=0.06, mass=0.1, base="fixed", gravity=(0, 0, -9.81))
+    hand = scene.hand_object()
+    assert scene.joint_names == ("left", "right") and hand.joint_names == ("left",)
+    grasps = hand.grasps(scene.qpos(joints={"left": 0.0, "right": 0.0}, object=[0, 0, 0, 1, 0, 0, 0]))
+    assert grasps.touching == 2 and grasps.joint_stiffness.shape[-2:] == (1, 1)
+    np.testing.assert_allclose(hand.couplings.constant, [[1.0], [multiplier]])
+    found = jg.largest_disturbance(grasps.contacts, PUSHES, required_wrench=grasps.required_wrench)
+    assert grasps.actuation is None and found.status == jg.Status.SOLVED and found.margin > 1
 
 
 WELDED = (
