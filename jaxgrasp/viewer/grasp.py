@@ -123,8 +123,9 @@ def _list_links(axes: Any, links: Sequence[str], numbers: np.ndarray, colours: S
     """Which link each contact is of, a line each at the panel's edge."""
     for line, number in enumerate(numbers.tolist()):
         colour = colours[number % len(colours)]
-        place = (-0.19, 0.92 - 0.045 * line)
-        axes.text2D(*place, f"{number}  {links[number]}", color=colour, fontsize=7, transform=axes.transAxes)
+        place = (-0.14, 0.92 - 0.045 * line)
+        words = axes.text2D(*place, f"{number}  {links[number]}", color=colour, fontsize=7, transform=axes.transAxes)
+        words.set_in_layout(False)
 
 
 def _draw_disc(axes: Any, centre: np.ndarray, normal: np.ndarray, radius: float) -> None:
