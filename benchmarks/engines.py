@@ -24,7 +24,7 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxgrasp.hands import HandObject, Scene  # noqa: E402
 from jaxgrasp.hands.engines import Geometry  # noqa: E402
-from jaxgrasp.hands.hand_files import hand_file  # noqa: E402
+from jaxgrasp.hands.hand_names import hand_file  # noqa: E402
 from jaxgrasp.hands.mujoco_engine import MujocoEngine  # noqa: E402
 from jaxgrasp.hands.object_files import PRIMITIVES  # noqa: E402
 

@@ -1,26 +1,29 @@
-"""Which hands load and rank, and which are refused? `python -m benchmarks.hands_that_load [FILE ...]`.
+"""Which hands load and rank, and which are refused? `python -m benchmarks.hands_that_load [FILE[:BODY] ...]`.
 
-Hands get a ball of 6 cm between their outermost links, joints half closed; a FILE that has a body named "object" is a
-scene of its own, ranked as it stands. Writes hands_that_load.md beside this file.
+Hands get a ball of 6 cm; a FILE with a body named "object", or BODY, is a scene of its own with that as the object.
+`jaxgrasp rank` ranks random configurations of each: joints anywhere in the middle of their ranges, the object between
+the outermost links. Writes hands_that_load.md beside this file.
 """
 
 from __future__ import annotations
 
 import argparse
+import subprocess
+import sys
+import tempfile
 import warnings
 from pathlib import Path
 
-import jax
 import mujoco
 import numpy as np
 
-jax.config.update("jax_enable_x64", True)
+import jaxgrasp as jg
+from jaxgrasp.hands import HandObject, Scene
+from jaxgrasp.hands.bodies import bodies_below
 
-import jaxgrasp as jg  # noqa: E402
-from jaxgrasp.hands import HandObject, Scene  # noqa: E402
-
-PUSHES = jg.DisturbanceSet.forces(1.0)
-WIDTH, CONTACTS = 0.06, 4
+WIDTH, COUNT = 0.06, 24
+# Shares of the ranges of joints, and how far the object is moved from the middle of the outermost links, m.
+MIDDLE, SHIFT = (0.2, 0.8), 0.01
 PADS = '<geom type="box" size=".01 .012 .02" pos="0 0 .02"/>'
 # Two slides that one tendon drives and an equality couples, as in the Panda's hand.
 PANDA_LIKE = f"""<mujoco><worldbody><body name="hand"><geom type="box" size=".03 .1 .03" pos="0 0 -.06"/>
@@ -69,54 +72,113 @@ HANDS = {
 }
 
 
-def scene_of(hand: str) -> tuple[HandObject, np.ndarray]:
-    """The hand with an object, and a configuration (nq,)."""
-    if Path(hand).suffix == ".xml" and "object" in (body.name for body in mujoco.MjSpec.from_file(hand).bodies):
-        found = HandObject.from_mjcf(hand, "object", max_contacts=CONTACTS)
-        return found, found.model.qpos0
-    given = mujoco.MjSpec.from_string(hand) if hand.startswith("<mujoco") else hand
+def scene_of(hand: str, folder: Path) -> tuple[str, str]:
+    """The file of a scene with the hand, and the object's body in it."""
+    path, _, body = hand.partition(":") if not hand.startswith("<mujoco") else (hand, "", "")
+    if Path(path).is_file():
+        # Files of other kinds are refused where they are ranked.
+        try:
+            names = [each.name for each in mujoco.MjSpec.from_file(path).bodies]
+        except ValueError:
+            return path, "object"
+        if body or "object" in names:
+            return path, body or "object"
+    given = mujoco.MjSpec.from_string(hand) if hand.startswith("<mujoco") else path
     scene = Scene.build(hand=given, object="sphere", scale=WIDTH, mass=0.1, base="fixed", gravity=(0, 0, 0))
-    found, model = scene.hand_object(max_contacts=CONTACTS), scene.model
-    data, places = mujoco.MjData(model), model.jnt_qposadr[found.joints]
-    limited = model.jnt_limited[found.joints].astype(bool)
-    data.qpos[places] = np.where(limited, model.jnt_range[found.joints].mean(-1), model.qpos0[places])
-    mujoco.mj_kinematics(model, data)
-    outermost = [b for b in found.touching_links if not np.isin(b, model.body_parentid)]
-    middle = data.xipos[outermost].mean(0)
-    return found, scene.qpos(joints=data.qpos[places], object=np.r_[middle, 1, 0, 0, 0])[0]
+    scene.save(folder / "scene.xml")
+    return str(folder / "scene.xml"), "object"
+
+
+def configurations(hand: HandObject) -> np.ndarray:
+    """Random ones (COUNT, nq)."""
+    random, model, data = np.random.default_rng(0), hand.model, mujoco.MjData(hand.model)
+    places, limited = model.jnt_qposadr[hand.joints], model.jnt_limited[hand.joints].astype(bool)
+    low, high = model.jnt_range[hand.joints].T
+    outermost = np.array([b for b in hand.touching_links if not np.isin(b, model.body_parentid)])
+    # Fingers are at the ends of the longest chains.
+    length = hand.moved_bodies[outermost].sum(-1)
+    outermost = outermost[length >= 0.7 * length.max()]
+    found = np.tile(model.qpos0, (COUNT, 1))
+    for qpos in found:
+        share = random.uniform(*MIDDLE, len(places))
+        qpos[places] = np.where(limited, low + share * (high - low), model.qpos0[places])
+        data.qpos = qpos
+        follow(model, data)
+        mujoco.mj_kinematics(model, data)
+        goal = data.xipos[outermost].mean(0) + random.uniform(-SHIFT, SHIFT, 3)
+        move_object(hand, data, goal - data.xipos[hand.object_body])
+        qpos[:] = data.qpos
+    return found
+
+
+def follow(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Puts joints where their couplings to others want them."""
+    for equality in np.flatnonzero(model.eq_active0 & (model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT))):
+        ends = model.eq_obj1id[equality], model.eq_obj2id[equality]
+        follower, leader = (model.jnt_qposadr[joint] for joint in ends)
+        moved = 0.0 if ends[1] < 0 else data.qpos[leader] - model.qpos0[leader]
+        data.qpos[follower] = model.qpos0[follower] + np.polynomial.Polynomial(model.eq_data[equality, :5])(moved)
+
+
+def move_object(hand: HandObject, data: mujoco.MjData, shift: np.ndarray) -> None:
+    """Moves the object, by a free joint or by slides, as far as it has them."""
+    model = hand.model
+    joints = np.flatnonzero(np.isin(model.jnt_bodyid, bodies_below(model, hand.object_body)))
+    for joint in joints:
+        start = model.jnt_qposadr[joint]
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            data.qpos[start : start + 3] += shift
+        elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+            data.qpos[start] += shift @ data.xaxis[joint]
 
 
 def row(name: str, hand: str) -> str:
     """One row of the table."""
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
         try:
-            found, qpos = scene_of(hand)
-            grasps = found.grasps(qpos[None], "mujoco")
-            weight = grasps.required_wrench
-            answer = jg.largest_disturbance(grasps.contacts, PUSHES, required_wrench=weight, actuation=grasps.actuation)
+            with warnings.catch_warnings():
+                # The command line says the same.
+                warnings.simplefilter("ignore", UserWarning)
+                scene, body = scene_of(hand, folder)
+                found = HandObject.from_mjcf(scene, body)
         except ValueError as error:
-            return f"| {name} | refused | | | | {' '.join(str(error).split())} |"
-    notes = " ".join(sorted({str(w.message) for w in told if w.category is UserWarning}))
+            path = hand.partition(":")[0]
+            return f"| {name} | refused | | | | {' '.join(str(error).replace(path, Path(path).name).split())} |"
+        np.savez(folder / "configurations.npz", qpos=configurations(found))
+        options = ["--figure", "None", "--picture", "None", "--min-contacts", "0", "--max-penetration", "1"]
+        files = ["--qpos", str(folder / "configurations.npz"), "--output", str(folder / "table.npz")]
+        command = [sys.executable, "-m", "jaxgrasp.cli", "rank", "--scene", scene, "--object-body", body]
+        ran = subprocess.run([*command, *files, *options], capture_output=True, text=True)
+        said = [line.removeprefix("jaxgrasp: ") for line in ran.stderr.splitlines() if "scene:" in line]
+        if ran.returncode:
+            return f"| {name} | exit {ran.returncode} | | | | {ran.stderr.splitlines()[-1]} |"
+        with np.load(folder / "table.npz") as table:
+            columns = {column: table[column] for column in ("status", "margin", "touching")}
+    grasps = found.grasps(found.model.qpos0[None], "mujoco")
     efforts = "none" if grasps.actuation is None else str(grasps.actuation.transmission.shape[-1])
-    cells = [name, f"{len(found.joints)}, {len(found.actuators)}, {efforts}", str(int(grasps.touching[0]))]
-    cells += [jg.Status(int(answer.status[0])).name, f"{float(answer.margin[0]):.3f}", notes]
+    counts = {status.name: int((columns["status"] == status.name).sum()) for status in jg.Status}
+    statuses = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    cells = [name, f"{len(found.joints)}, {len(found.actuators)}, {efforts}", f"{np.median(columns['touching']):g}"]
+    cells += [statuses, f"{np.nanmax(columns['margin'], initial=-np.inf):.3f}", " ".join(said)]
     return "| " + " | ".join(cells) + " |"
 
 
 def main() -> None:
     """Writes the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("files", nargs="*", help="more hands, or scenes with a body named object; MJCF or URDF")
+    parser.add_argument("files", nargs="*", help="more hands, or FILE:BODY, scenes with their object; MJCF or URDF")
     options = parser.parse_args()
     lines = [
-        "# Hands that load",
+        "# Hands that load and rank",
         "",
-        f"A ball of {100 * WIDTH:g} cm between half-closed links, without gravity; scenes of their own as they stand; "
-        f"the {CONTACTS} nearest links. Statuses say that ranking works, not how good the hands are. Made by "
-        "`python -m benchmarks.hands_that_load`.",
+        f"{COUNT} random configurations of each, ranked by `jaxgrasp rank`: joints in the middle "
+        f"{MIDDLE[1] - MIDDLE[0]:.0%} of their ranges, the object within {100 * SHIFT:g} cm of the middle of the "
+        f"outermost links; a ball of {100 * WIDTH:g} cm without gravity, or a scene's own object with its weight. "
+        "Statuses say that ranking works to the end, not how good the hands are: random grasps reach deep into the "
+        "object, or bear no weight. Made by `python -m benchmarks.hands_that_load`.",
         "",
-        "| hand | joints, actuators, efforts | links that touch | status | margin, N | said |",
+        "| hand | joints, actuators, efforts | links that touch, median | statuses | best margin, N | said |",
         "|---|---|---|---|---|---|",
     ]
     hands = HANDS | {"/".join(Path(file).parts[-3:]): file for file in options.files}

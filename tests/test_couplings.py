@@ -8,7 +8,7 @@ import pytest
 from test_passive import PUSHES, closed, four_pads, independent_margin, ranked
 
 import jaxgrasp as jg
-from jaxgrasp.hands import HandObject
+from jaxgrasp.hands import HandObject, Scene
 
 COUPLED = {
     "linear": '<equality><joint joint1="j1" joint2="j0" polycoef="0 1 0 0 0"/></equality>',
@@ -66,3 +66,67 @@ def test_a_gripper_whose_slides_are_coupled():
     # The actuator gives what all four pads press with.
     assert float(least.actuator_efforts[0]) == pytest.approx(18.097, abs=1e-2)
     np.testing.assert_allclose(-least.forces[:, 2].sum(), least.actuator_efforts[0], rtol=1e-6)
+
+
+MIMIC = """<robot name="gripper"><link name="palm"/>{links}
+<joint name="left" type="prismatic"><parent link="palm"/><child link="l"/><origin xyz="0 .04 0"/><axis xyz="0 -1 0"/>
+<limit lower="0" upper=".04" effort="20" velocity="1"/></joint>
+<joint name="right" type="prismatic"><parent link="palm"/><child link="r"/><origin xyz="0 -.04 0"/><axis xyz="0 1 0"/>
+<limit lower="0" upper=".04" effort="20" velocity="1"/><mimic joint="left" multiplier="{multiplier}"/>
+</joint></robot>"""
+JAW = """<link name="{}"><collision><geometry><box size=".02 .02 .04"/></geometry></collision><inertial>
+<mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+@pytest.mark.parametrize("multiplier", [1.0, 0.5])
+def test_joints_of_urdf_mimic_others(multiplier, tmp_path):
+    file = tmp_path / "gripper.urdf"
+    file.write_text(MIMIC.format(links=JAW.format("l") + JAW.format("r"), multiplier=multiplier))
+    scene = Scene.build(hand=file, object="sphere", scale=0.06, mass=0.1, base="fixed", gravity=(0, 0, -9.81))
+    hand = scene.hand_object()
+    assert scene.joint_names == ("left", "right") and hand.joint_names == ("left",)
+    grasps = hand.grasps(scene.qpos(joints={"left": 0.0, "right": 0.0}, object=[0, 0, 0, 1, 0, 0, 0]))
+    assert grasps.touching == 2 and grasps.joint_stiffness.shape[-2:] == (1, 1)
+    np.testing.assert_allclose(hand.couplings.constant, [[1.0], [multiplier]])
+    found = jg.largest_disturbance(grasps.contacts, PUSHES, required_wrench=grasps.required_wrench)
+    assert grasps.actuation is None and found.status == jg.Status.SOLVED and found.margin > 1
+
+
+WELDED = (
+    "<worldbody>{mocap}{palm}"
+    '<body name="object" pos="0 0 -.03"><freejoint/><geom type="box" size=".02 .02 .02" mass=".1"/></body></worldbody>'
+    '<actuator><position joint="left" kp="100" forcerange="-5 5"/><position joint="right" kp="100" '
+    'forcerange="-5 5"/></actuator><equality><weld body1="{holder}" body2="palm"/></equality>'
+)
+MOCAP = '<body name="mocap" mocap="true"/>'
+FINGERS = "".join(
+    f'<body pos="0 {y} -.03"><joint name="{name}" type="slide" axis="0 {-np.sign(y)} 0"/><geom size=".01"/></body>'
+    for name, y in (("left", 0.03), ("right", -0.03))
+)
+ARM = (
+    '<body name="arm" pos="0 0 .2"><joint name="arm" axis="0 1 0"/><geom size=".01" mass="1"/>'
+    f'<body name="palm" pos="0 0 -.2"><joint name="wrist" axis="1 0 0"/><geom size=".005" mass="1"/>{FINGERS}</body>'
+    "</body>"
+)
+
+
+@pytest.mark.parametrize(("mocap", "holder"), [(MOCAP, "mocap"), ("", "world")])
+def test_a_weld_holds_the_joints_of_an_arm(mocap, holder):
+    """As of the same fingers on a palm without an arm."""
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{WELDED.format(mocap=mocap, palm=ARM, holder=holder)}</mujoco>")
+    hand = HandObject.from_mjcf(model, "object")
+    assert hand.joint_names == ("left", "right")
+    alone = f'<body name="palm"><geom size=".005" mass="1"/>{FINGERS}</body>'
+    bare = f"<mujoco>{WELDED.format(mocap='', palm=alone, holder='world').partition('<equality>')[0]}</mujoco>"
+    margins = []
+    for one in (model, mujoco.MjModel.from_xml_string(bare)):
+        grasps = HandObject.from_mjcf(one, "object").grasps(one.qpos0)
+        given = {"required_wrench": grasps.required_wrench, "actuation": grasps.actuation}
+        margins.append(float(jg.largest_disturbance(grasps.contacts, PUSHES, **given).margin))
+    assert margins[0] == pytest.approx(margins[1], rel=1e-9) and margins[0] > 1
+
+
+def test_a_weld_of_two_bodies_that_move_is_refused():
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{WELDED.format(mocap='', palm=ARM, holder='arm')}</mujoco>")
+    with pytest.raises(ValueError, match="equality constraint 0 is of kind weld"):
+        HandObject.from_mjcf(model, "object")

@@ -115,7 +115,13 @@ def test_batches_of_any_shape():
     same(jax.jit(jax.vmap(hand.grasps))(qpos[:6]), slice(6), (6,))
 
 
-def test_the_nearest_contacts_are_kept():
+def nearest_in_turn(distances: np.ndarray, links: np.ndarray, count: int) -> np.ndarray:
+    """The least distance of every link that touches, then the next one of each, then what is apart; in order."""
+    turn = [np.inf if distance > 0 else np.sum(links[:k] == links[k]) for k, distance in enumerate(distances)]
+    return np.sort(distances[np.lexsort([distances, turn])[:count]])
+
+
+def test_the_nearest_contacts_are_kept_of_all_links_in_turn():
     hand, qpos = composite()
     whole = grasps_of_parts()
     few = jax.tree.map(
@@ -131,7 +137,8 @@ def test_the_nearest_contacts_are_kept():
         ).grasps(qpos, "distance"),
     )
     assert few.distances.shape == (COUNT, 2)
-    assert np.array_equal(few.distances, whole.distances[:, :2])
+    wanted = [nearest_in_turn(*row, 2) for row in zip(whole.distances, whole.links, strict=True)]
+    assert np.array_equal(few.distances, wanted) and np.any(few.distances != whole.distances[:, :2])
     assert np.array_equal(few.touching, whole.touching) and few.touching.max() > 2
     assert np.array_equal(few.left_out, np.maximum(whole.touching - 2, 0))
     assert np.array_equal(few.penetration, np.maximum(0, -whole.distances[:, 0]))

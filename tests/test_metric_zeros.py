@@ -106,6 +106,22 @@ def test_balls_without_closure_are_zero():
         assert radius > 1e-6 if closed[row] else radius == 0
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_rings_without_friction_close_nothing(there):
+    """Radial forces in a plane span three dimensions; of grasps without contacts there is not even a plane."""
+    angles = np.random.default_rng(0).uniform(0, 2 * np.pi, (40, 3))
+    ring = np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
+    contacts = jg.Contacts.from_normals(0.03 * ring, ring, friction=0.0, max_force=1.0, active=np.full((40, 3), there))
+    found = metrics.force_closure(contacts, SPACE)
+    assert not found.closed.any() and (found.status == jg.Status.SOLVED).all()
+    assert (found.min_weight <= 0).all() and np.isfinite(found.separating_twist).all()
+    work = np.einsum("nced,nd->nce", metrics.edge_wrenches(contacts, WrenchSpace(length=1.0)), found.separating_twist)
+    assert work.max() < 1e-6
+    assert not metrics.task_wrench(contacts, jg.DisturbanceSet.forces(1.0), SPACE).any()
+    for norm in ("L1", "Linf"):
+        assert metrics.ferrari_canny(jax.tree.map(lambda x: x[0], contacts), norm, SPACE) == 0
+
+
 @pytest.mark.thorough
 def test_gradients_without_closure_are_zero():
     contacts = contacts_of(np.float64)

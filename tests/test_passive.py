@@ -205,6 +205,8 @@ def test_gravity_compensation_of_the_object_and_gravity_that_is_off():
         ('friction="0.3" priority="2"', 'friction="0.7"', "", 0.3),
         ("", "", '<contact><pair geom1="g0" geom2="cube" condim="1"/></contact>', 0.0),
         ("", "", '<contact><pair geom1="g0" geom2="cube" friction="0.2 0.2 0 0 0"/></contact>', 0.2),
+        ("", "", '<option o_friction="0.3 0.3 0 0 0"><flag override="enable"/></option>', 0.3),
+        ('condim="1"', 'condim="1"', '<option o_friction="0.3 0.3 0 0 0"><flag override="enable"/></option>', 0.0),
     ],
 )
 def test_friction_and_dimension_are_combined_as_in_mujoco(pad, cube, rest, friction):
@@ -252,13 +254,33 @@ def test_margin_and_gap_say_how_far_contacts_push(engine):
     assert np.asarray(grasps.links)[np.asarray(grasps.contacts.active)].tolist() == [model.body("f1").id]
 
 
-def test_what_is_not_modelled_is_said():
-    for options in ({"pad": 'condim="4"'}, {"rest": PAIR}):
-        with pytest.warns(UserWarning, match=r"torsional|two tangential"):
-            grasped(four_pads(**options))
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"pad": 'condim="4"'}, "torsional and rolling friction is left out"),
+        ({"rest": '<contact><pair geom1="g0" geom2="cube" friction="{}"/></contact>'}, "'g0' and 'cube'.* 0.2 and 0.4"),
+        ({"rest": '<option o_friction="{}"><flag override="enable"/></option>'}, "0.2 and 0.4, of which the smaller"),
+    ],
+)
+@pytest.mark.parametrize("friction", ["0.2 0.4 0 0 0", "0.4 0.2 0 0 0"])
+def test_what_is_not_modelled_is_said_once(options, words, friction):
+    """Of two tangential coefficients the smaller one counts, whatever the engine."""
+    options = {name: value.format(friction) for name, value in options.items()}
+    with pytest.warns(UserWarning, match=words) as told:
+        hand, grasps = grasped(four_pads(**options))
+    assert len(told) == 1
+    if "rest" in options:
+        for found in (grasps, hand.grasps(closed(hand.model), "distance")):
+            assert found.contacts.friction[list(found.links).index(1)] == pytest.approx(0.2)
 
 
-PAIR = '<contact><pair geom1="g0" geom2="cube" friction="0.2 0.4 0 0 0"/></contact>'
+@pytest.mark.parametrize("engine", ["mujoco", "distance"])
+def test_margins_of_the_options_say_how_far_contacts_push(engine):
+    rest = '<option o_margin="{}"><flag override="enable"/></option>'
+    for margin, contacts in ((0.0, 0), (0.012, 4)):
+        model = mujoco.MjModel.from_xml_string(four_pads(pad='margin="0.02"', rest=rest.format(margin)))
+        qpos = closed(model) - np.r_[np.full(4, 0.01), np.zeros(7)]
+        assert HandObject.from_mjcf(model, "object").grasps(qpos, engine).contacts.active.sum() == contacts
 
 
 def test_many_points_of_one_finger_keep_no_other_finger_out():
@@ -292,6 +314,12 @@ def test_many_points_of_one_finger_keep_no_other_finger_out():
             np.testing.assert_allclose(margins, 15.3165, atol=2e-3)
     few = HandObject.from_mjcf(model, "object", max_contacts=1).grasps(qpos)
     assert (few.left_out == 1).all() and (few.touching == 2).all()
+    some = HandObject.from_mjcf(model, "object", points_per_link=None, max_contacts=8)
+    for engine in ("mujoco", "distance"):
+        grasps = some.grasps(qpos, engine)
+        kept = [[model.body(b).name for b in links] for links in np.asarray(grasps.links)]
+        assert all(links.count("left") == links.count("right") == 4 for links in kept)
+        assert (grasps.left_out == 8).all() and (np.diff(grasps.distances) >= 0).all()
 
 
 def independent_margin(grasps) -> float:

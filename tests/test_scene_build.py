@@ -132,7 +132,7 @@ def test_a_saved_scene_is_the_same(files, tmp_path):
     ("options", "message"),
     [
         ({"hand": "nix.xml"}, r"^hand: got .*nix.xml', and there is no such file"),
-        ({"hand": "nix"}, r"^hand: got 'nix', wanted an MJCF or URDF file, shadow_hand, four_fingers, or FOLDER/FILE"),
+        ({"hand": "nix"}, r"^hand: got 'nix', wanted an MJCF or URDF file, shadow_hand, four_fingers, FOLDER/FILE"),
         ({"hand": "none.xml"}, r"^hand: .*none.xml cannot be read: .*Schema violation"),
         ({"hand": "floor.xml"}, r"^hand: .*floor.xml cannot be used: it has a plane or a height field"),
         ({"hand": "own.xml"}, r"^hand: .*own.xml cannot be used: it has a free joint of its own"),

@@ -212,6 +212,16 @@ def test_a_picture_without_forces(graphics, tmp_path):
     assert matplotlib.image.imread(tmp_path / "scene.png")[..., :3].std() > 0.05
 
 
+def test_an_object_without_a_free_joint_is_drawn_where_it_is_named(graphics, tmp_path):
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="object"><geom size="0.03"/></body><body pos="0.05 0 0"><joint/>'
+        '<geom size="0.02"/></body></worldbody></mujoco>'
+    )
+    points, forces = np.array([[[0.03, 0, 0]]]), np.array([[[-1.0, 0, 0]]])
+    draw_scenes(tmp_path / "object.png", model, model.qpos0[None], points, forces, ["one"], object_body=1)
+    assert (tmp_path / "object.png").stat().st_size > 10_000
+
+
 def test_an_arrow_ends_where_the_contact_is(graphics, tmp_path):
     xml = """<mujoco><worldbody><body><freejoint/><geom size="0.003" rgba="1 0 0 1"/></body></worldbody></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)

@@ -1,14 +1,17 @@
 """Figures: that they can be made of any ranking, and that what they draw stands where the numbers say."""
 
+import mujoco
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3D
 
 from jaxgrasp.candidates import Candidates, sample_grasps
+from jaxgrasp.hands import HandObject, sample_configurations, scenes
 from jaxgrasp.ranking import Ranking
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.viewer import draw_grasp, figure_of_ranking, write_figure
+from jaxgrasp.viewer.solids import held_by, triangles_of
 
 
 def ranking_of(margin, status=None, top=3) -> Ranking:
@@ -90,3 +93,47 @@ def test_absent_contacts_are_not_drawn():
     active = np.array([True, False, True])
     draw_grasp(axes, position, normal, -normal, friction=np.full(3, 0.5), active=active)
     assert [text.get_text() for text in axes.texts] == ["0", "2"]
+
+
+BOX, MESH = 'type="box" size="0.1 0.2 0.3"', 'type="mesh" mesh="corner"'
+VOLUMES = {
+    BOX: 8 * 0.1 * 0.2 * 0.3,
+    'size="0.1"': 4 / 3 * np.pi * 0.1**3,
+    'type="capsule" size="0.1 0.2"': np.pi * 0.1**2 * (0.4 + 4 / 3 * 0.1),
+    'type="cylinder" size="0.1 0.2"': np.pi * 0.1**2 * 0.4,
+    'type="ellipsoid" size="0.1 0.2 0.3"': 4 / 3 * np.pi * 0.1 * 0.2 * 0.3,
+    MESH: 1 / 6,
+    'type="plane" size="1 1 1"': 0.0,
+}
+
+
+@pytest.mark.parametrize("geom", VOLUMES)
+def test_surfaces_of_geoms_enclose_their_volumes(geom):
+    """From outside the corners go round counterclockwise: signed tetrahedra add up to the volume."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><asset><mesh name="corner" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>'
+        f"<worldbody><geom {geom}/></worldbody></mujoco>"
+    )
+    a, b, c = np.moveaxis(triangles_of(model, 0), 1, 0)
+    volume = np.einsum("ni,ni->", a, np.cross(b, c)) / 6
+    # 24 corners round a circle, which they are inside of.
+    assert volume == pytest.approx(VOLUMES[geom], rel=1e-6 if geom in (BOX, MESH) else 0.04)
+
+
+def test_panels_show_hand_object_and_links_of_contacts():
+    hand = HandObject.from_mjcf(scenes.four_fingers(), "object")
+    (qpos,) = sample_configurations(hand, 1, seed=3)
+    held = held_by(hand, qpos)
+    corners = np.concatenate(held.object).reshape(-1, 3)
+    np.testing.assert_allclose(np.linalg.norm(corners, axis=-1), 0.025, rtol=1e-6)
+    contacts = hand.grasps(qpos).contacts
+    points, there = np.asarray(contacts.positions), np.asarray(contacts.active)
+    # Contacts are on the hand's surface and on the object's.
+    for point in points[there]:
+        assert min(np.linalg.norm(part - point, axis=-1).min() for part in held.hand) < 0.008
+    axes = Figure().add_subplot(projection="3d")
+    normals = np.asarray(contacts.frames)[..., 2]
+    draw_grasp(axes, points, normals, -normals, friction=np.ones(len(points)), active=there, held=held)
+    words = " ".join(text.get_text() for text in axes.texts)
+    assert all(name in words for name, active in zip(held.links, there, strict=True) if active)
+    assert {hand.model.body(name).id for name in held.links} <= set(hand.bodies.tolist())

@@ -34,8 +34,8 @@ class HandScene:
     """The object of a scene that comes with the package: sphere, capsule, box, cylinder, ellipsoid, mesh, or a FILE."""
 
     hand: str | None = None
-    """A hand of your own in place of --scene, with --object: an MJCF or URDF file, shadow_hand or four_fingers, or
-    FOLDER/FILE of a local copy of mujoco_menagerie."""
+    """A hand of your own in place of --scene, with --object: an MJCF or URDF file, shadow_hand or four_fingers,
+    FOLDER/FILE of a local copy of mujoco_menagerie, or an entry of robot_descriptions that was downloaded before."""
 
     mass: float | None = None
     """With --hand: of the object, kg; None is that of the file, or of water."""

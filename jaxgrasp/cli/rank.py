@@ -215,7 +215,8 @@ class Rank(Reading):
         from jaxgrasp.viewer import figure_of_ranking, write_figure
 
         def write_picture(path: Path) -> None:
-            write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity)), path)
+            held = self.of_hand.held(hands, ranking) if hands else None
+            write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity), held=held), path)
 
         written, failed = write_files(
             (self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture)

@@ -1,6 +1,7 @@
 """The options by which `jaxgrasp rank` and `compare` take candidates from configurations of a hand."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.hands import HandObject
     from jaxgrasp.ranking import Ranking
+    from jaxgrasp.viewer.held import Held
 
 SAMPLED = 2_000
 _PICTURES = 4
@@ -156,6 +158,19 @@ class GivenScene(HandScene):
                 raise CommandError(f"{self.qpos}: {name}: got shape {column.shape}; wanted ({len(qpos)}, ...)")
         return np.asarray(qpos, float), columns
 
+    def held(self, hands: "list[HandObject]", ranking: "Ranking") -> "Callable[[int], Held]":
+        """What finds the hand and the object around the contacts of a candidate, by its number."""
+        from jaxgrasp.viewer.solids import held_by
+
+        columns = ranking.candidates.columns
+
+        def of_candidate(row: int) -> "Held":
+            return held_by(
+                hands[int(columns["scene"][row]) if "scene" in columns else 0], columns["qpos"][row], self.engine
+            )
+
+        return of_candidate
+
     def draw(self, hands: "list[HandObject]", ranking: "Ranking", unit: str, path: Path) -> None:
         """Renders the best configurations with their tightening forces.
 
@@ -178,7 +193,7 @@ class GivenScene(HandScene):
         points, forces = (np.asarray(x) for x in grasps.in_world_frame(forces))
         titles = [f"#{b + 1}: margin {ranking.margin[row]:.3g} {unit}" for b, row in zip(best, rows, strict=True)]
         try:
-            draw_scenes(path, hand.model, qpos, points, forces, titles)
+            draw_scenes(path, hand.model, qpos, points, forces, titles, hand.object_body)
         except RuntimeError as error:
             raise OSError(str(error)) from error
 

@@ -173,7 +173,7 @@ class SceneSynthesis(HandScene):
         best = kept.take(kept.diverse(_PICTURES, self.diversity))
         titles = [f"#{n + 1}: margin {margin:.3g} {unit}" for n, margin in enumerate(best.margin)]
         try:
-            draw_scenes(path, hand.model, best.qpos, best.contact_points, best.forces, titles)
+            draw_scenes(path, hand.model, best.qpos, best.contact_points, best.forces, titles, hand.object_body)
         except RuntimeError as error:
             raise OSError(str(error)) from error
 

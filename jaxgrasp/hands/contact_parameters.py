@@ -11,7 +11,9 @@ class ContactParameters(NamedTuple):
     """Of one pair of geoms."""
 
     friction: float
-    """Coulomb's coefficient; 0 where condim is 1."""
+    """Coulomb's coefficient, the smaller one of the two tangents; 0 where condim is 1."""
+    widest: float
+    """The larger one."""
     margin: float
     """Contacts push up to this distance, m."""
     condim: int
@@ -46,15 +48,17 @@ def hand_object_pairs(
     for number, (one, other) in enumerate(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)):
         for pair in ((one, other), (other, one)):
             if pair[0] in of_hand and pair[1] in of_object:
-                condim = int(model.pair_dim[number])
-                friction = coulomb(model.pair_friction[number], condim)
-                found[pair] = ContactParameters(float(friction), float(model.pair_margin[number]), condim)
+                condim, margin = model.pair_dim[number], model.pair_margin[number]
+                found[pair] = _parameters(model.pair_friction[number], margin, condim)
+    if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+        # The scene's options count in place of all geoms and pairs.
+        option = model.opt
+        found = {pair: _parameters(option.o_friction, option.o_margin, own.condim) for pair, own in found.items()}
     if not found:
         raise ValueError(
             "scene: no geom of the hand can touch a geom of the object; "
             "wanted contype and conaffinity that let some of them collide"
         )
-    _warn(model, found)
     return found
 
 
@@ -68,23 +72,30 @@ def _combined(model: mujoco.MjModel, a: int, b: int) -> ContactParameters:
     rows = [a, b]
     if model.geom_priority[a] != model.geom_priority[b]:
         rows = [a if model.geom_priority[a] > model.geom_priority[b] else b]
-    condim = int(model.geom_condim[rows].max())
-    friction = 0.0 if condim == 1 else float(model.geom_friction[rows, 0].max())
-    return ContactParameters(friction, float(model.geom_margin[[a, b]].sum()), condim)
+    sliding = model.geom_friction[rows, 0].max()
+    return _parameters(np.full(2, sliding), model.geom_margin[[a, b]].sum(), model.geom_condim[rows].max())
 
 
-def _warn(model: mujoco.MjModel, found: dict[tuple[int, int], ContactParameters]) -> None:
-    """Says what of the contacts is not modelled."""
+def _parameters(friction: np.ndarray, margin: float, condim: int) -> ContactParameters:
+    least, most = coulomb(friction, condim), -coulomb(-friction, condim)
+    return ContactParameters(float(least), float(most), float(margin), int(condim))
+
+
+def warn_of_simplifications(model: mujoco.MjModel, found: dict[tuple[int, int], ContactParameters]) -> None:
+    """Warns of what of the contacts is not modelled."""
     if any(parameters.condim > 3 for parameters in found.values()):
         warnings.warn(
             "scene: contacts have condim 4 or 6, whose torsional and rolling friction is left out: margins are those "
             "of condim 3",
-            stacklevel=4,
+            stacklevel=3,
         )
-    two = model.pair_friction[:, 0] != model.pair_friction[:, 1]
-    if np.any(two & (model.pair_dim > 1)):
-        warnings.warn(
-            "scene: contact pairs have two tangential friction coefficients, of which the smaller one counts in all "
-            "directions",
-            stacklevel=4,
-        )
+    for pair, parameters in found.items():
+        if parameters.friction != parameters.widest:
+            names = " and ".join(repr(model.geom(g).name or f"number {g}") for g in pair)
+            warnings.warn(
+                f"scene: contacts of geoms {names}, for example, have two tangential friction coefficients, "
+                f"{parameters.friction:g} and {parameters.widest:g}, of which the smaller one counts in all "
+                "directions: margins are those of a narrower cone",
+                stacklevel=3,
+            )
+            break

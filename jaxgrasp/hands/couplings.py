@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxgrasp.hands.actuators import moved_by
+
 
 @dataclass(frozen=True)
 class Couplings:
@@ -85,7 +87,7 @@ def read_couplings(model: mujoco.MjModel, dofs: np.ndarray) -> Couplings:
             else:
                 reference = model.qpos0[model.jnt_qposadr[leader]]
                 found.append((at, place[int(model.jnt_dofadr[leader])], slopes, reference))
-        elif kind not in (mujoco.mjtEq.mjEQ_WELD,) or not _holds_a_base(model, e):
+        elif kind != mujoco.mjtEq.mjEQ_WELD or not (_holds_a_base(model, e) or _held_by(model, e).any()):
             raise ValueError(
                 f"scene: equality constraint {model.equality(e).name or e!r} is of kind {kind.name[5:].lower()}; "
                 "wanted couplings of joints alone"
@@ -98,6 +100,23 @@ def read_couplings(model: mujoco.MjModel, dofs: np.ndarray) -> Couplings:
         reference=np.array([f[3] for f in found]),
         free=np.setdiff1d(np.arange(len(dofs)), follower),
     )
+
+
+def held_by_welds(model: mujoco.MjModel) -> np.ndarray:
+    """The joints that a weld to the world, to a mocap body or to what else cannot move holds where they are."""
+    held = np.zeros(model.nv, bool)
+    for equality in np.flatnonzero(model.eq_active0 & (model.eq_type == int(mujoco.mjtEq.mjEQ_WELD))).tolist():
+        held |= _held_by(model, equality)
+    return np.flatnonzero(held[model.jnt_dofadr])
+
+
+def _held_by(model: mujoco.MjModel, weld: int) -> np.ndarray:
+    """The degrees of freedom (nv,) that it holds."""
+    none = np.zeros(model.nv, bool)
+    if model.eq_objtype[weld] != int(mujoco.mjtObj.mjOBJ_BODY):
+        return none
+    one, other = (moved_by(model, int(body)) for body in (model.eq_obj1id[weld], model.eq_obj2id[weld]))
+    return none if one.any() and other.any() else one | other
 
 
 def _holds_a_base(model: mujoco.MjModel, equality: int) -> bool:

@@ -1,6 +1,5 @@
 """Hands as MuJoCo reads them: by file, by name, or as a specification, on a base that is free, fixed or mocap."""
 
-import os
 import xml.etree.ElementTree as ElementTree
 from os import PathLike
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 
 from jaxgrasp.hands.bodies import one_line
 from jaxgrasp.hands.files import compile_file
-from jaxgrasp.hands.scenes import HAND_FILES
+from jaxgrasp.hands.hand_names import hand_file
 
 BASES = ("free", "fixed", "mocap")
 BASE = "hand-base"
@@ -25,7 +24,7 @@ def hand_on_base(hand: str | PathLike | mujoco.MjSpec, base: str) -> mujoco.MjSp
     """A specification in which the whole world of a hand's file stands on a base.
 
     Args:
-        hand: An MJCF or URDF file, a specification, or a name that `hand_file` knows.
+        hand: An MJCF or URDF file, a specification, or a name that `hand_names.hand_file` knows.
         base: "free" (a body with a free joint), "fixed" (as in the file), or "mocap" (a free body that is welded to a
             mocap body).
 
@@ -59,33 +58,6 @@ def hand_on_base(hand: str | PathLike | mujoco.MjSpec, base: str) -> mujoco.MjSp
         weld = out.add_equality(name=_DRIVER, type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
         weld.name1, weld.name2 = _DRIVER, BASE
     return out
-
-
-def hand_file(hand: str | PathLike) -> Path:
-    """The file of a hand: a path, the name of a built-in one, or FOLDER/FILE of a local copy of mujoco_menagerie.
-
-    The copy is where the environment variable MUJOCO_MENAGERIE says, or where `robot_descriptions` keeps it. Nothing
-    is downloaded.
-
-    Raises:
-        ValueError: There is no such file.
-    """
-    if str(hand) in HAND_FILES:
-        return HAND_FILES[str(hand)]()
-    path = Path(hand)
-    if path.suffix:
-        if not path.is_file():
-            raise ValueError(f"hand: got {str(hand)!r}, and there is no such file; wanted an MJCF or URDF file")
-        return path
-    cache = Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE") or Path.home() / ".cache" / "robot_descriptions")
-    folders = [Path(f) for f in (os.environ.get("MUJOCO_MENAGERIE"), cache / "mujoco_menagerie") if f]
-    for folder in folders:
-        if (found := folder / f"{hand}.xml").is_file():
-            return found
-    raise ValueError(
-        f"hand: got {str(hand)!r}, wanted an MJCF or URDF file, {', '.join(HAND_FILES)}, or FOLDER/FILE in a copy of "
-        f"mujoco_menagerie ({' or '.join(map(str, folders))})"
-    )
 
 
 def read_spec(argument: str, path: Path) -> mujoco.MjSpec:

@@ -28,8 +28,8 @@ from jaxgrasp.hands.bodies import (
     read_model,
     wrench_against_weight,
 )
-from jaxgrasp.hands.contact_parameters import hand_object_pairs
-from jaxgrasp.hands.couplings import Couplings, read_couplings
+from jaxgrasp.hands.contact_parameters import hand_object_pairs, warn_of_simplifications
+from jaxgrasp.hands.couplings import Couplings, held_by_welds, read_couplings
 from jaxgrasp.hands.distance_engine import DistanceEngine
 from jaxgrasp.hands.engines import Engine, engine_for
 from jaxgrasp.hands.grasps import HandGrasps
@@ -55,7 +55,7 @@ class HandObject:
     bodies: np.ndarray
     """The hand's bodies."""
     joints: np.ndarray
-    """The hand's joints, hinges and slides; free joints count as held where they are."""
+    """The hand's joints, hinges and slides; free and welded ones count as held where they are."""
     dofs: np.ndarray
     """Their degrees of freedom."""
     contact_distance: float
@@ -98,8 +98,8 @@ class HandObject:
                 Grasps in files stand some millimetres off the surface.
             points_per_link: 1 makes one contact of each link, at the mean of its points that touch; more are as many
                 points of each link, spread apart; None makes every point a contact.
-            max_contacts: Of how many links a grasp keeps the contacts, the nearest ones (where every point is a
-                contact: how many points); None is all.
+            max_contacts: Of how many links a grasp keeps the contacts, the nearest ones; where every point is a
+                contact, how many points, of all links in turn. None is all.
             max_force: Largest normal force of every contact, N.
             friction: Coulomb's coefficient for all contacts; None is what MuJoCo makes of the geoms'.
             unreached: What joint directions do that neither an actuator nor a friction, a stop or a spring of a joint
@@ -132,11 +132,10 @@ class HandObject:
         joints = np.flatnonzero(np.isin(model.jnt_bodyid, hand))
         for joint in joints[model.jnt_type[joints] == BALL]:
             raise ValueError(f"scene: joint {model.joint(joint).name!r} is a ball; wanted hinges and slides")
-        joints = joints[np.isin(model.jnt_type[joints], (HINGE, SLIDE))]
+        joints = joints[np.isin(model.jnt_type[joints], (HINGE, SLIDE)) & ~np.isin(joints, held_by_welds(model))]
         dofs = model.jnt_dofadr[joints]
-        pairs = hand_object_pairs(model, hand, of_object)
+        warn_of_simplifications(model, pairs := hand_object_pairs(model, hand, of_object))
         couplings, actuators = read_couplings(model, dofs), read_actuators(model, dofs)
-        passive = read_passive(model, joints)
         return cls(
             model=model,
             object_body=body,
@@ -150,7 +149,7 @@ class HandObject:
             couplings=couplings,
             touching_links=np.unique(model.geom_bodyid[[geom for geom, _ in pairs]]),
             _actuators=actuators,
-            _mechanics=Mechanics(model, joints, couplings, actuators, passive, unreached),
+            _mechanics=Mechanics(model, joints, couplings, actuators, read_passive(model, joints), unreached),
         )
 
     @property

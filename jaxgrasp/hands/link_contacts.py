@@ -67,7 +67,8 @@ class ContactRule:
     points_per_link: int | None
     """1 is the mean of a link's points that count; more are as many of them, spread apart; None is all points."""
     max_contacts: int | None
-    """How many links, the nearest ones, have contacts (points instead, where all points are contacts); None is all."""
+    """How many links, the nearest ones, have contacts; where all points are contacts: how many points, first the
+    nearest of every link that touches, then the next of each. None is all."""
 
     def contacts(self, raw: RawPoints, links: np.ndarray, xp: ModuleType) -> LinkContacts:
         """The contacts.
@@ -78,23 +79,43 @@ class ContactRule:
             xp: numpy or jax.numpy.
         """
         if self.points_per_link is None:
-            return _nearest(_all_points(raw, xp), self.max_contacts, xp)
+            points = _all_points(raw, xp)
+            return _kept(points, _in_turn(points, links, xp)[:, : self.max_contacts], xp)
         found = [_of_link(raw, int(link), self.points_per_link, xp) for link in links]
         stacked = LinkContacts(*(xp.stack(parts, 1) for parts in zip(*found, strict=True)))
-        kept = _nearest(stacked, self.max_contacts, xp)
+        kept = _kept(stacked, _order(stacked.distance.min(-1), xp)[:, : self.max_contacts], xp)
         flat = lambda x: x.reshape(x.shape[0], -1, *x.shape[3:])  # noqa: E731
         return LinkContacts(*map(flat, kept[:-2]), kept.touching, kept.left_out)
 
 
-def _nearest(contacts: LinkContacts, count: int | None, xp: ModuleType) -> LinkContacts:
-    """The nearest `count` along the second axis, in order; a third one has the points of a link."""
+def _kept(contacts: LinkContacts, chosen: Array, xp: ModuleType) -> LinkContacts:
+    """The chosen ones along the second axis, the nearest first; a third one has the points of a link."""
     distance = contacts.distance
     distance = distance.min(-1) if distance.ndim == 3 else distance
-    order = xp.argsort(distance, axis=-1, stable=True)[:, :count]
-    pick = lambda x: xp.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - 2)), axis=1)  # noqa: E731
-    kept = [pick(x) for x in contacts[:-2]]
+    order = _picked(chosen, _order(_picked(distance, chosen, xp), xp), xp)
+    kept = [_picked(x, order, xp) for x in contacts[:-2]]
     counts = [(x.any(-1) if x.ndim == 3 else x).sum(-1) for x in (contacts.active, kept[-1])]
     return LinkContacts(*kept, counts[0], counts[0] - counts[1])
+
+
+def _in_turn(points: LinkContacts, links: np.ndarray, xp: ModuleType) -> Array:
+    """Points (n, slots) in the order in which they are kept: the nearest of every link that touches, then the next.
+
+    Without turns a flat side of one link, nearer by a nanometre, would keep all others out.
+    """
+    near = _order(points.distance, xp)
+    link, active = (_picked(x, near, xp) for x in (points.link, points.active))
+    turn = sum(xp.where(link == own, xp.cumsum(link == own, -1), 0) for own in links)
+    return _picked(near, _order(xp.where(active, turn, near.shape[-1] + 1), xp), xp)
+
+
+def _order(values: Array, xp: ModuleType) -> Array:
+    return xp.argsort(values, axis=-1, stable=True)
+
+
+def _picked(x: Array, order: Array, xp: ModuleType) -> Array:
+    """Those along the second axis that `order` (n, k) names."""
+    return xp.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - 2)), axis=1)
 
 
 def _all_points(raw: RawPoints, xp: ModuleType) -> LinkContacts:

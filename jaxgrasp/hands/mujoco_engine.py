@@ -45,6 +45,7 @@ class MujocoEngine:
         # Margins of the two geoms add up; pairs that are spelt out have their own.
         model.geom_margin[self._is_object] += contact_distance
         model.pair_margin[:] += contact_distance
+        model.opt.o_margin += contact_distance
         self._masses = np.maximum(model.body_mass[object], 1e-12)
 
     def find(self, qpos: np.ndarray) -> Geometry:

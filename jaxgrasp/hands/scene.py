@@ -61,7 +61,7 @@ class Scene:
         """Builds a scene.
 
         Args:
-            hand: An MJCF or URDF file, a specification, or the name of a built-in or installed hand (`hand_file`).
+            hand: An MJCF or URDF file, a specification, or a name: see `hand_names.hand_file`.
             object: A folder of convex pieces, a mesh (.obj, .stl, .msh; its convex hull is what touches), an MJCF or
                 URDF file or specification of a rigid object, or "sphere", "capsule", "box", "cylinder" or "ellipsoid",
                 1 m wide along x. Its file's frame is the frame of its body.

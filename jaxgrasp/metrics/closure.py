@@ -54,8 +54,8 @@ def min_weight(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Ar
 
     Returns:
         (*batch,), exactly 0 on the boundary of closure, negative beyond it, -inf where no weights of any sign that sum
-        up to 1 cancel; NaN for data that are not admissible or a program that could not be solved. Differentiable where
-        finite and not 0; elsewhere gradients are zero.
+        up to 1 cancel; NaN for data that are not admissible or, where the edges span the space, a program that could
+        not be solved. Differentiable where finite and not 0; elsewhere gradients are zero.
 
     Raises:
         ValueError: options or shapes that do not fit.
@@ -92,7 +92,8 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     left, singular = _decomposed(edges)
     spans = _spans(edges, singular)
     positive = least * _count(edges) > _LEAST_WEIGHT[dtype.name]
-    known = edges.valid & (dual.status != Status.MAX_ITERATIONS)
+    # Edges that do not span the space close nothing, whether or not the program could be solved.
+    known = edges.valid & ((dual.status != Status.MAX_ITERATIONS) | ~spans)
     closed = known & spans & positive
     # The multipliers are what the weights exceed the least one by.
     weights = jnp.where(edges.counted & closed[..., None], dual.z + least[..., None], 0)
@@ -100,7 +101,7 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     forces = jnp.einsum("...ce,...cea->...ca", weights, edges.forces)
     # A twist along which every edge does negative work; where they do not span the space, one along which they do none.
     flat_twist = left[..., -1] if left.shape[-1] == 6 else _orthogonal(left)
-    twist = jnp.where((positive & ~spans)[..., None], flat_twist, dual.x[..., :6])
+    twist = jnp.where(~spans[..., None], flat_twist, dual.x[..., :6])
     twist = safe_divide(twist, jnp.max(jnp.abs(twist), -1, keepdims=True))
     turned = jnp.concatenate([twist[..., :3], twist[..., 3:] / edges.length[..., None]], -1)
     status = jnp.where(known, int(Status.SOLVED), int(Status.MAX_ITERATIONS))
@@ -147,9 +148,10 @@ def _spans(edges: Edges, singular: jax.Array) -> jax.Array:
 
 
 def _above_rounding(edges: Edges, least: jax.Array, spans: jax.Array) -> jax.Array:
-    """The least weight, and 0 where it is not told from 0 or is positive without closure."""
+    """The least weight, and 0 where it is not told from 0, or where edges that span no space have none below 0."""
     tolerance = _LEAST_WEIGHT[least.dtype.name] / _count(edges)
-    return jnp.where((jnp.abs(least) <= tolerance) | ((least > 0) & ~spans), 0, least)
+    flat = ~spans & ((least > 0) | (edges.valid & jnp.isnan(least)))
+    return jnp.where((jnp.abs(least) <= tolerance) | flat, 0, least)
 
 
 def _count(edges: Edges) -> jax.Array:

@@ -41,7 +41,7 @@ def ferrari_canny(contacts: Contacts, norm: Norm = "L1", space: WrenchSpace | No
         return math.nan
     check_norm(norm)
     groups = [np.asarray(w) for w, there in zip(edges.wrenches, edges.present, strict=True) if there]
-    points = _flat(groups) if norm == "L1" else _sums(groups)
+    points = _flat(groups) if norm == "L1" or not groups else _sums(groups)
     hull = one_hull(points)
     radius = 0.0 if hull is None else float(-hull.equations[:, -1].max())
     return radius if radius > _SMALLEST_BALL * np.linalg.norm(points, axis=-1).max() else 0.0

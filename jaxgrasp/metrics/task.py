@@ -80,6 +80,6 @@ def _scaled(contacts: Contacts, vertices: jax.Array, space: WrenchSpace) -> jax.
     each = jnp.where(found.status == Status.SOLVED, jnp.where(counted, found.objective, 0), jnp.nan)
     # The solver tells a wrench from zero to this share of the longest one that the fingers can exert.
     longest = jnp.max(safe_norm(W), -1, initial=0)[..., None]
-    each = jnp.where(each * safe_norm(wanted) <= _ROUNDING[dtype.name] * longest, 0, each)
+    each = jnp.where((each * safe_norm(wanted) <= _ROUNDING[dtype.name] * longest) | (longest == 0), 0, each)
     value = jnp.min(jnp.where(counted, each, jnp.inf), -1)
     return jnp.where(valid, value, jnp.nan)

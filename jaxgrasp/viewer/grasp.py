@@ -9,9 +9,13 @@ from jaxtyping import Bool, Float
 from matplotlib.colors import to_rgb
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
+from jaxgrasp.viewer.held import Held, draw_held
+
 CONTACT_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _CONE_SIDES = 24
 _MILLIMETRES = 1e3
+# Half a panel's width, in units of the farthest contact's distance from the centre of mass: alone, and amid a hand.
+_LIMIT, _LIMIT_OF_HAND = 1.35, 1.8
 
 
 def draw_grasp(
@@ -24,6 +28,7 @@ def draw_grasp(
     active: Bool[np.ndarray, " contacts"] | None = None,
     load: Float[np.ndarray, "3"] | None = None,
     surface: Float[np.ndarray, "points 3"] | None = None,
+    held: Held | None = None,
     scale: float | None = None,
     colours: Sequence[str] = CONTACT_COLOURS,
 ) -> float:
@@ -40,6 +45,7 @@ def draw_grasp(
         active: False where a contact is absent; all present where None.
         load: A direction in which a weight pulls at the centre of mass, drawn as an arrow.
         surface: Points on the object that hint at its shape, m.
+        held: The hand and the object around the contacts; the names of links are then listed beside the panel.
         scale: Newtons per millimetre of the drawing; chosen so that the longest arrow fits where None.
         colours: One a contact, in turn.
 
@@ -54,7 +60,11 @@ def draw_grasp(
     strength = np.nan_to_num(np.linalg.norm(forces, axis=-1))
     if scale is None:
         scale = round_scale(float(strength.max()) / (0.75 * reach)) if strength.any() else np.nan
-    _frame(axes, points, reach)
+    limit = (_LIMIT if held is None else _LIMIT_OF_HAND) * reach
+    _frame(axes, points, limit)
+    if held is not None:
+        draw_held(axes, held, limit / _MILLIMETRES)
+        _list_links(axes, held.links, np.flatnonzero(present), colours)
     if surface is not None:
         axes.scatter(*(surface * _MILLIMETRES).T, s=5.0, color="0.6", alpha=0.5, linewidths=0, depthshade=False)
     for i, number in enumerate(np.flatnonzero(present).tolist()):
@@ -109,6 +119,15 @@ def _draw_cone(axes: Any, apex: np.ndarray, normal: np.ndarray, friction: float,
     axes.plot(*np.concatenate([rim, rim[:1]]).T, color=colour, linewidth=0.8)
 
 
+def _list_links(axes: Any, links: Sequence[str], numbers: np.ndarray, colours: Sequence[str]) -> None:
+    """Which link each contact is of, a line each at the panel's edge."""
+    for line, number in enumerate(numbers.tolist()):
+        colour = colours[number % len(colours)]
+        place = (-0.14, 0.92 - 0.045 * line)
+        words = axes.text2D(*place, f"{number}  {links[number]}", color=colour, fontsize=7, transform=axes.transAxes)
+        words.set_in_layout(False)
+
+
 def _draw_disc(axes: Any, centre: np.ndarray, normal: np.ndarray, radius: float) -> None:
     rim = centre + radius * _circle(normal, _CONE_SIDES)
     axes.add_collection3d(Poly3DCollection([rim], facecolors=(0.5, 0.5, 0.5, 0.35), edgecolors="0.45", linewidths=0.5))
@@ -126,7 +145,7 @@ def _draw_arrow(axes: Any, tail: np.ndarray, tip: np.ndarray, colour: str, head:
     axes.add_collection3d(Poly3DCollection([*sides, rim], facecolors=colour, edgecolors="none"))
 
 
-def _frame(axes: Any, points: np.ndarray, reach: float) -> None:
+def _frame(axes: Any, points: np.ndarray, limit: float) -> None:
     # Seen along the direction in which the contacts spread least, from above.
     _, _, directions = np.linalg.svd(points - points.mean(axis=0))
     view = directions[-1] * (1.0 if directions[-1, 2] >= 0.0 else -1.0)
@@ -136,7 +155,6 @@ def _frame(axes: Any, points: np.ndarray, reach: float) -> None:
     quadrant, within = divmod(azimuth, 90.0)
     azimuth = 90.0 * quadrant + min(max(within, 20.0), 70.0)
     axes.view_init(elev=float(elevation), azim=azimuth)
-    limit = 1.35 * reach
     box = (-limit, limit)
     axes.set(xlim=box, ylim=box, zlim=box, xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
     axes.xaxis.labelpad = axes.yaxis.labelpad = axes.zaxis.labelpad = -4.0

@@ -47,7 +47,7 @@ def write_movie(
     time = runs[0][1].time
     moments = np.arange(max(begin, time[0]), min(end, time[-1]) + 1e-9, _FRAME / slower)
     steps = np.minimum(np.searchsorted(time, moments - 1e-9), len(time) - 1)
-    model, frames = for_pictures(model, _PIXELS), []
+    model, frames = for_pictures(model, pixels=_PIXELS), []
     data = mujoco.MjData(model)
     data.qpos[:] = runs[0][1].qpos[0, runs[0][2]]
     mujoco.mj_forward(model, data)

@@ -1,5 +1,6 @@
 """The figure of a ranking: how the margins are distributed, and what the best grasps look like."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,21 @@ from jaxgrasp.ranking import Ranking
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.storage import atomic_write
 from jaxgrasp.viewer.grasp import CONTACT_COLOURS, draw_grasp
+from jaxgrasp.viewer.held import Held
 
 # A margin below this, in multiples of the disturbance set, is drawn as none: the solver's own tolerance.
 _NOTHING = 1e-6
 _SURFACE_POINTS = 1500
 
 
-def figure_of_ranking(ranking: Ranking, *, unit: str = "N", loaded: bool = False, grasps: int = 4) -> Figure:
+def figure_of_ranking(
+    ranking: Ranking,
+    *,
+    unit: str = "N",
+    loaded: bool = False,
+    grasps: int = 4,
+    held: Callable[[int], Held] | None = None,
+) -> Figure:
     """Draws the distribution of the margins and the best grasps with their tightening forces.
 
     Where the candidates have a column `object_name`, the contacts of all candidates on the same object are drawn as
@@ -33,6 +42,8 @@ def figure_of_ranking(ranking: Ranking, *, unit: str = "N", loaded: bool = False
         unit: Unit of the margin: "N" where the disturbances are forces of 1 N.
         loaded: Whether a weight along -z was to be borne; it is then drawn.
         grasps: How many of the best that have forces to draw, at most.
+        held: The hand and the object of a candidate, by its number: they are then drawn around its contacts, and the
+            hand's links are named.
 
     Returns:
         The figure; `savefig` writes it.
@@ -48,7 +59,7 @@ def figure_of_ranking(ranking: Ranking, *, unit: str = "N", loaded: bool = False
     for number, place in enumerate(shown, start=1):
         # Added one by one: matplotlib cannot lay out a 3D panel that is there and not visible.
         panel = right.add_subplot(-(-len(shown) // columns), columns, number, projection="3d", proj_type="ortho")
-        _draw_panel(panel, ranking, place, unit, loaded)
+        _draw_panel(panel, ranking, place, unit, loaded, held and held(ranking.order[place]))
     right.legend(handles=_legend(loaded), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return figure
 
@@ -110,7 +121,7 @@ def _draw_counts(axes: Axes, counts: dict[str, int]) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _draw_panel(panel: Any, ranking: Ranking, place: int, unit: str, loaded: bool) -> None:
+def _draw_panel(panel: Any, ranking: Ranking, place: int, unit: str, loaded: bool, held: Held | None) -> None:
     candidates, row = ranking.candidates, ranking.order[place]
     scale = draw_grasp(
         panel,
@@ -121,6 +132,7 @@ def _draw_panel(panel: Any, ranking: Ranking, place: int, unit: str, loaded: boo
         active=candidates.active[row],
         load=np.array([0.0, 0.0, -1.0]) if loaded else None,
         surface=_surface(ranking, row),
+        held=held,
     )
     source = Path(candidates.sources[candidates.source[row]]).stem
     name = candidates.columns["object_name"][row] if "object_name" in candidates.columns else source

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
+from jaxgrasp.hands.bodies import bodies_below
 from jaxgrasp.viewer.grasp import CONTACT_COLOURS, round_scale
 from jaxgrasp.viewer.offscreen import offscreen
 from jaxgrasp.viewer.ranking import write_figure
@@ -27,6 +28,7 @@ def draw_scenes(
     contact_points: Float[np.ndarray, "scenes contacts 3"],
     forces: Float[np.ndarray, "scenes contacts 3"],
     titles: Sequence[str],
+    object_body: int | None = None,
 ) -> None:
     """Renders some configurations of a hand and an object, one panel each, and writes the picture.
 
@@ -36,14 +38,15 @@ def draw_scenes(
 
     Args:
         path: The file; its ending says the format (png, pdf, ...).
-        model: Hand and object, the object a body with a free joint.
+        model: Hand and object.
         configurations: The model's `qpos`.
         contact_points: World frame, m.
         forces: Of the fingers on the object, world frame, N. Not drawn where it or the point is NaN or it is zero.
         titles: One a panel.
+        object_body: The object's body, with all below it; None is every body with a free joint.
 
     Raises:
-        ValueError: The arrays' shapes do not fit the model and each other, or the model has no free body.
+        ValueError: The arrays' shapes do not fit the model and each other, or nothing is the object.
         RuntimeError: No OpenGL context can be had; the message names the remedy.
         OSError: The file cannot be written.
     """
@@ -51,15 +54,19 @@ def draw_scenes(
         np.asarray(array, float) for array in (configurations, contact_points, forces)
     )
     _check(model, configurations, contact_points, forces, titles)
+    of_object = _of_object(model, object_body)
+    if not of_object.any():
+        raise ValueError("model: got no body with a free joint and a geom, wanted an object")
     # NaN in the points counts as no force.
     forces = np.where(np.isfinite(contact_points).all(-1, keepdims=True), np.nan_to_num(forces), 0.0)
     strongest = np.linalg.norm(forces, axis=-1).max(initial=0.0)
     newtons_per_mm = round_scale(float(strongest) / (1e3 * _LONGEST_ARROW)) if strongest > 0.0 else np.nan
     arrows = forces / (1e3 * newtons_per_mm) if strongest > 0.0 else forces
 
-    model = for_pictures(model)
+    model = for_pictures(model, of_object)
     with offscreen(model, _PIXELS, _PIXELS) as render:
-        pictures = [render(_scene(model, *each)) for each in zip(configurations, contact_points, arrows, strict=True)]
+        panels = zip(configurations, contact_points, arrows, strict=True)
+        pictures = [render(_scene(model, of_object, *each)) for each in panels]
     write_figure(_compose(pictures, titles, newtons_per_mm), path)
 
 
@@ -72,24 +79,32 @@ def _check(
     for name, array in (("contact_points", points), ("forces", forces)):
         if array.ndim != 3 or array.shape != (count, points.shape[1], 3):
             raise ValueError(f"{name}: got {array.shape}, wanted ({count}, contacts, 3)")
-    if not _of_object(model).any():
-        raise ValueError("model: got no body with a free joint and a geom, wanted an object")
 
 
-def _of_object(model: mujoco.MjModel) -> Bool[np.ndarray, " geoms"]:
+def _of_object(model: mujoco.MjModel, body: int | None) -> Bool[np.ndarray, " geoms"]:
+    if body is not None:
+        return np.isin(model.geom_bodyid, bodies_below(model, body))
     free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     return np.isin(model.body_rootid[model.geom_bodyid], free)
 
 
-def for_pictures(model: mujoco.MjModel, pixels: int = _PIXELS) -> mujoco.MjModel:
-    """A copy that is lit from the camera and through whose hand one can see, for square pictures."""
+def for_pictures(
+    model: mujoco.MjModel, of_object: Bool[np.ndarray, " geoms"] | None = None, pixels: int = _PIXELS
+) -> mujoco.MjModel:
+    """A copy that is lit from the camera and through whose hand one can see, for square pictures.
+
+    Args:
+        model: Hand and object.
+        of_object: Which geoms are the object's; None is those of every body with a free joint.
+        pixels: Width and height.
+    """
     model = copy(model)
     model.vis.global_.offwidth = model.vis.global_.offheight = pixels
     model.vis.headlight.ambient[:] = 0.45
     model.vis.headlight.diffuse[:] = 0.45
     model.vis.headlight.specular[:] = 0.0
     model.light_active[:] = 0
-    hand = ~_of_object(model)
+    hand = ~(_of_object(model, None) if of_object is None else of_object)
     # A geom with a material has its colour from there; materials may be shared with the object, geoms' colours are not.
     for geom in np.flatnonzero(hand).tolist():
         material = model.geom_matid[geom]
@@ -99,13 +114,15 @@ def for_pictures(model: mujoco.MjModel, pixels: int = _PIXELS) -> mujoco.MjModel
     return model
 
 
-def _scene(model: mujoco.MjModel, configuration: np.ndarray, points: np.ndarray, arrows: np.ndarray) -> mujoco.MjvScene:
+def _scene(
+    model: mujoco.MjModel, of_object: np.ndarray, configuration: np.ndarray, points: np.ndarray, arrows: np.ndarray
+) -> mujoco.MjvScene:
     data = mujoco.MjData(model)
     data.qpos[:] = configuration
     mujoco.mj_forward(model, data)
     drawn = np.flatnonzero(arrows.any(-1))
     tips, tails = points[drawn], (points - arrows)[drawn]
-    geoms = np.flatnonzero(_of_object(model))
+    geoms = np.flatnonzero(of_object)
     centre = data.geom_xpos[geoms].mean(0)
     # As wide for short arrows as for the longest: the panels are to be compared.
     radius = (np.linalg.norm(data.geom_xpos[geoms] - centre, axis=-1) + model.geom_rbound[geoms]).max() + _LONGEST_ARROW
