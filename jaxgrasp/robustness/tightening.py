@@ -16,12 +16,14 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited
 from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge, spot
+from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.derivatives import CentralPoint, Point, envelope_adjoint
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.robustness.program import Program, prepared
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening_lanes import at_centre, evidence, solve_effort, solve_margin
+from jaxgrasp.solvers.block_kkt import Record
 from jaxgrasp.solvers.status import Status
 
 
@@ -80,7 +82,7 @@ def largest_disturbance(
     """
     pyramid_facets(cone_edges)
     return over_grasps(
-        _LargestDisturbance(cone_edges, smoothing is not None),
+        _LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"),
         contacts,
         disturbances,
         required_wrench=required_wrench,
@@ -141,7 +143,7 @@ def least_effort(
     """
     pyramid_facets(cone_edges)
     return over_grasps(
-        _LeastEffort(cone_edges, smoothing is not None),
+        _LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"),
         contacts,
         disturbances,
         required_wrench=required_wrench,
@@ -156,16 +158,21 @@ def least_effort(
 
 @dataclass(frozen=True)
 class _Tightening(OfPyramids, Audited, ABC):
-    """What the kernels of (21) and (22) share; their results are a solution and evidence for its audit."""
+    """What the kernels of (21) and (22) share; their results are a solution and, for its audit, evidence."""
 
     smooth: bool
+    evident: bool = True
+    """Whether there is evidence: what nobody looks at is not worth its memory."""
 
     @property
     def stages(self) -> tuple:
         return (lambda grasps, _: prepared(grasps, self.cone_edges), lambda given: self._solve(*given))
 
     @abstractmethod
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]: ...
+    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]: ...
+
+    def _evidence(self, grasps: Grasps, program: Program, record: Record) -> Evidence | None:
+        return evidence(grasps, program, record) if self.evident else None
 
     def judge(self, arguments: Arguments, out: tuple[Solution, Evidence], anew: bool) -> Verdict:
         return judge(arguments, *out, anew, self.smooth)
@@ -189,15 +196,15 @@ class _Tightening(OfPyramids, Audited, ABC):
 
 
 class _LargestDisturbance(_Tightening):
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]:
+    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
         best, record, iterate = solve_margin(grasps, program)
         solution = best
         if grasps.smoothing is not None:
             possible = ~(program.wrench_outside | program.disturbance_outside | program.undisturbed)
             solution = at_centre(grasps, program, iterate, best, grasps.valid & possible)
-        return solution, evidence(grasps, program, record)
+        return solution, self._evidence(grasps, program, record)
 
-    def tangents(self, along: Along, found: tuple[Solution, Evidence]) -> tuple[Solution, Evidence]:
+    def tangents(self, along: Along, found: tuple) -> tuple:
         out = found[0]
         point = self._point(out, jnp.isfinite(out.margin) & (out.status != Status.PRUNED))
         change = self._central(along, point)
@@ -208,16 +215,16 @@ class _LargestDisturbance(_Tightening):
 
 
 class _LeastEffort(_Tightening):
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence]:
+    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
         first, record, _ = solve_margin(replace(grasps, smoothing=None), program)
-        return solve_effort(grasps, program, first, record), evidence(grasps, program, record)
+        return solve_effort(grasps, program, first, record), self._evidence(grasps, program, record)
 
-    def tangents(self, along: Along, found: tuple[Solution, Evidence]) -> tuple[Solution, Evidence]:
+    def tangents(self, along: Along, found: tuple) -> tuple:
         out = found[0]
         return _changed(found, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)
 
 
-def _changed(found: tuple[Solution, Evidence], change: Point, upper_bound: jax.Array | None) -> tuple:
+def _changed(found: tuple[Solution, Evidence | None], change: Point, upper_bound: jax.Array | None) -> tuple:
     """A change of the results; None for what does not vary, or counts as if it did not."""
     varying = change._asdict() | {"upper_bound": upper_bound}
     still = jax.tree.map(lambda _: None, found[1])
