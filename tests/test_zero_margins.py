@@ -86,7 +86,7 @@ def test_of_many_zeros_a_part_is_looked_at():
         return stacked(["above"] * len(rows))
 
     (line,) = why_zero(contacts_of, np.ones(2500, bool), BOX)
-    assert "834 of 834 looked at" in line and asked == [834]
+    assert "834 of 834 looked at" in line and asked == [1024]
 
 
 def two_fingers(path, count: int = 24) -> None:

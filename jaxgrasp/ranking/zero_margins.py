@@ -1,5 +1,6 @@
 """Why margins are zero: what the contacts of a grasp lack, in words."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -7,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.compliance import RANK_TOLERANCE
+from jaxgrasp.direct import power_of_two
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.metrics import WrenchSpace
 from jaxgrasp.metrics.interior import contains_origin
@@ -64,7 +67,10 @@ def why_zero(
     if not len(rows):
         return []
     looked_at = rows[:: -(-len(rows) // _LOOKED_AT)]
-    found = _reasons(contacts_of(looked_at), disturbances, cone_edges)
+    # Of few sizes, so that there are few programs.
+    more = np.full(power_of_two(len(looked_at), 1) - len(looked_at), looked_at[-1])
+    found = np.asarray(_reasons(contacts_of(np.concatenate([looked_at, more])), disturbances, cone_edges))
+    found = found[: len(looked_at)]
     of = "" if len(looked_at) == len(rows) else f" of {len(looked_at):,} looked at"
     counts = {reason: int((found == number).sum()) for number, reason in enumerate(_REASONS)}
     return [
@@ -74,25 +80,25 @@ def why_zero(
     ]
 
 
-def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) -> np.ndarray:
+@functools.partial(compiled, static_argnums=(2,), pace=lambda *_: "soon")
+def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) -> jax.Array:
     """The place of each grasp's reason in `_REASONS`."""
     edges = edges_of(contacts, WrenchSpace(cone_edges=cone_edges))
-    G = np.moveaxis(np.asarray(edges.grasp_map), -3, -2).reshape(*edges.valid.shape, 6, -1)
-    left, found, _ = np.linalg.svd(G)
-    singular = np.zeros((len(G), 6), G.dtype)
-    singular[:, : found.shape[-1]] = found
+    G = jnp.moveaxis(edges.grasp_map, -3, -2).reshape(*edges.valid.shape, 6, -1)
+    left, found, _ = jnp.linalg.svd(G)
+    singular = jnp.zeros((len(G), 6), G.dtype).at[:, : found.shape[-1]].set(found)
     # Rows: directions of wrenches, and which of them no contact forces exert.
-    directions = np.swapaxes(left, -1, -2)
+    directions = jnp.swapaxes(left, -1, -2)
     unreached = singular <= RANK_TOLERANCE[G.dtype.name] * singular[:, :1]
-    twists = np.concatenate([directions[..., :3], directions[..., 3:] / np.asarray(edges.length)[:, None, None]], -1)
-    extent = np.maximum(disturbances.support(twists), disturbances.support(-twists))
-    disturbed = np.where(unreached, extent, 0).max(-1) > RANK_TOLERANCE[G.dtype.name] * extent.max(-1)
+    twists = jnp.concatenate([directions[..., :3], directions[..., 3:] / edges.length[:, None, None]], -1)
+    extent = jnp.maximum(disturbances.support(twists), disturbances.support(-twists))
+    disturbed = jnp.where(unreached, extent, 0).max(-1) > RANK_TOLERANCE[G.dtype.name] * extent.max(-1)
 
     # With both signs of what is lacking, the hull of the wrenches has the origin inside where it has it in their span.
-    lacking = jnp.asarray(np.where(unreached[..., None], directions, 0))
+    lacking = jnp.where(unreached[..., None], directions, 0)
     W = jnp.concatenate([edges.flat, lacking, -lacking], -2)
     longest = jnp.sqrt(jnp.max(jnp.sum(W * W, -1), -1))
-    closed = jax.jit(jax.vmap(contains_origin))(W / jnp.where(longest > 0, longest, 1)[..., None, None])
+    closed = jax.vmap(contains_origin)(W / jnp.where(longest > 0, longest, 1)[..., None, None])
 
     slippery = edges.present & (jnp.where(edges.present, contacts.friction, 1) == 0)
     conditions = {
@@ -103,4 +109,4 @@ def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) 
         "slippery": slippery.any(-1),
         "spare": jnp.ones_like(closed),
     }
-    return np.argmax(np.stack([np.asarray(conditions[reason]) for reason in _REASONS]), axis=0)
+    return jnp.argmax(jnp.stack([conditions[reason] for reason in _REASONS]), axis=0)
