@@ -35,8 +35,8 @@ print(read - begun, clock() - sorted_)
 """
 WHOLE = """
 import time
-from jaxgrasp.cli import main
 begun = time.perf_counter()
+from jaxgrasp.cli import main
 assert main(["rank", "grasps.npz", "--figure", "None"]) == 0
 print(time.perf_counter() - begun)
 """
