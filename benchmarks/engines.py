@@ -142,7 +142,8 @@ def reference(hand: HandObject, qpos: np.ndarray) -> Iterator[tuple[np.ndarray, 
     model = hand.model
     data = mujoco.MjData(model)
     mine = np.isin(model.geom_bodyid, hand.bodies)
-    object = model.geom_bodyid == hand.object_body
+    # Of bodies that are welded to it, too.
+    object = model.body_weldid[model.geom_bodyid] == model.body_weldid[hand.object_body]
     for row in qpos:
         data.qpos = row
         mujoco.mj_forward(model, data)

@@ -111,6 +111,13 @@ def test_what_a_few_lines_ask_for_is_not_given(tmp_path, name, content):
     assert time.process_time() - begun < 5.0
 
 
+def test_triangles_that_are_repeated_count_once():
+    corners = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    content = corners + b"f 1 3 2\nf 3 2 1\nf 1 2 4\nf 2 3 4\nf 2 1 3\nf 1 2 3\nf 1 4 3\n"
+    found = read_triangles(content, "obj", 100)[1]
+    np.testing.assert_array_equal(found, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 1, 2], [0, 3, 2]])
+
+
 def test_triangles_are_as_many_as_the_budget_allows(tmp_path):
     path = tmp_path / "ball.stl"
     coloured().export(path)

@@ -30,7 +30,7 @@ _TYPES |= dict(zip(("int8", "uint8", "int16", "uint16", "int32", "uint32", "floa
 
 
 def read_triangles(content: bytes, kind: str, most: int) -> Triangles:
-    """Reads vertices and triangles; polygons become fans about their first corner.
+    """Reads vertices and triangles, each of these once; polygons become fans about their first corner.
 
     Args:
         content: The file's.
@@ -47,7 +47,18 @@ def read_triangles(content: bytes, kind: str, most: int) -> Triangles:
         raise ValueError(f"{len(corners) - 2 * len(counts):,} triangles where {most:,} are allowed, see --read-limit")
     if corners.size and not (corners.min() >= 0 and corners.max() < len(vertices)):
         raise ValueError(f"corners that are none of its {len(vertices):,} vertices")
-    return vertices, _fans(corners, counts)
+    return vertices, _once(_fans(corners, counts), len(vertices))
+
+
+def _once(faces: np.ndarray, vertices: int) -> np.ndarray:
+    """Triangles without repetitions: they add nothing to a surface, but to what is inside of it, and to the time."""
+    first = faces.argmin(1)[:, None]
+    turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, 1).astype(np.int64)
+    # One number a triangle, as long as that holds it.
+    if vertices >= 1 << 20:
+        return faces
+    _, kept = np.unique((turned[:, 0] * vertices + turned[:, 1]) * vertices + turned[:, 2], return_index=True)
+    return faces if len(kept) == len(faces) else faces[np.sort(kept)]
 
 
 def _fans(corners: np.ndarray, counts: np.ndarray) -> np.ndarray:
