@@ -238,7 +238,7 @@ def report(rows: list[Row], engines: tuple[str, ...]) -> str:
     ]
     for row in rows:
         errors = np.concatenate([np.array(x) for x in row.pairs.values()]) if row.pairs else np.zeros(0)
-        share = f"{(errors <= NEAR).mean():.2%}" if len(errors) else "refused"
+        share = f"{(errors <= NEAR).mean():.2%}" if len(errors) else "refused" if row.refused else "-"
         times = [f"{number(row.first, e, 1)}; {number(row.rate, e, 0)}" for e in engines]
         cells = [row.hand, row.object, f"{row.exact} of {COUNT}", str(row.touching), share, *times]
         lines.append("| " + " | ".join(cells) + " |")
