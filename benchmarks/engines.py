@@ -226,7 +226,7 @@ def report(rows: list[Row], engines: tuple[str, ...]) -> str:
         "# Engines of contact geometry",
         "",
         f"{COUNT:,} random configurations each, touching, at most {1000 * DEEPEST:g} mm deep; contact distance 0. "
-        "Made by `python -m benchmarks.engines`.",
+        f"Made by `python -m benchmarks.engines --engines {' '.join(engines)}`.",
         "",
         f"{platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; jax {jax.__version__}, mujoco "
         f"{mujoco.__version__}, float64.",

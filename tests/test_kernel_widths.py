@@ -33,7 +33,8 @@ UNDECIDED = {"float64": 0.0, "float32": 0.005}
 """Share of lanes whose status rounding may change."""
 
 ELSEWHERE = {"float64": 0.005, "float32": 0.01}
-"""Share of lanes in which rounding may lead to another one of many best points, or of the multipliers at a kink."""
+"""Share of lanes in which rounding may lead to another one of many best points, or of the multipliers at a kink; in
+float64 of programs with round cones alone, whose forces vary as the root of a gap."""
 
 QUICK = [("plain", "float64", True), ("plain", "float32", False)]
 """Group, precision, and whether XLA is asked, too, which compiles for longer than all kernels together."""
@@ -87,7 +88,8 @@ def hold_against_xla(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray],
         lanes = np.setdiff1d(lanes, undecided.get(f"{program}: .status", []))
         if dtype == "float32":
             lanes = lanes[~proven_alone(ours, theirs, program, name, loose)[lanes]]
-        if len(lanes) > loose * ELSEWHERE[dtype] * kernel_programs.LANES:
+        several = loose and (dtype == "float32" or program.startswith("12"))
+        if len(lanes) > several * ELSEWHERE[dtype] * kernel_programs.LANES:
             wrong[name] = lanes.tolist()
     assert not wrong
 

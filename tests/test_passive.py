@@ -264,7 +264,7 @@ def test_margin_and_gap_say_how_far_contacts_push(engine):
 )
 @pytest.mark.parametrize("friction", ["0.2 0.4 0 0 0", "0.4 0.2 0 0 0"])
 def test_what_is_not_modelled_is_said_once(options, words, friction):
-    """Of two tangential coefficients the smaller one counts, whatever the engine."""
+    """Every engine takes the smaller one of two tangential coefficients."""
     options = {name: value.format(friction) for name, value in options.items()}
     with pytest.warns(UserWarning, match=words) as told:
         hand, grasps = grasped(four_pads(**options))

@@ -93,8 +93,8 @@ def outcome(arguments: list[str], given: Environment, home: Path) -> str:
     if all(line.startswith("jaxgrasp: ") for line in lines):
         if process.returncode == 0:
             return f"works, says {len(lines)}" if lines else "works"
-        if process.returncode == 2 and (lines or ">&-" in given.after):
-            return f"exit 2, says {len(lines)}"
+        if process.returncode == 2 and (len(lines) == 1 or ">&-" in given.after):
+            return "one line, exit 2"
     print(given.name, arguments, process.returncode, said[-2000:], file=sys.stderr, flush=True)
     return f"**exit {process.returncode}, {len(lines)} lines**"
 

@@ -159,7 +159,7 @@ class GivenScene(HandScene):
         return np.asarray(qpos, float), columns
 
     def held(self, hands: "list[HandObject]", ranking: "Ranking") -> "Callable[[int], Held]":
-        """What finds the hand and the object around the contacts of a candidate, by its number."""
+        """Returns a function that gives the hand and the object around a candidate's contacts, by its number."""
         from jaxgrasp.viewer.solids import held_by
 
         columns = ranking.candidates.columns

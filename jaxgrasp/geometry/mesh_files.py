@@ -30,7 +30,7 @@ _TYPES |= dict(zip(("int8", "uint8", "int16", "uint16", "int32", "uint32", "floa
 
 
 def read_triangles(content: bytes, kind: str, most: int) -> Triangles:
-    """Reads vertices and triangles, each of these once; polygons become fans about their first corner.
+    """Reads vertices and triangles, and drops repeated ones; polygons become fans about their first corner.
 
     Args:
         content: The file's.
@@ -51,12 +51,12 @@ def read_triangles(content: bytes, kind: str, most: int) -> Triangles:
 
 
 def _once(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """Triangles without repetitions: they add nothing to a surface, but to what is inside of it, and to the time."""
-    first = faces.argmin(1)[:, None]
-    turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, 1).astype(np.int64)
-    # One number a triangle, as long as that holds it.
+    """Drops repeated triangles, which take time and count twice in winding numbers; keeps all of very large meshes."""
+    # One number stands for a triangle, as long as 64 bits hold it.
     if vertices >= 1 << 20:
         return faces
+    first = faces.argmin(1)[:, None]
+    turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, 1).astype(np.int64)
     _, kept = np.unique((turned[:, 0] * vertices + turned[:, 1]) * vertices + turned[:, 2], return_index=True)
     return faces if len(kept) == len(faces) else faces[np.sort(kept)]
 

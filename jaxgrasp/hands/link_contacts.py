@@ -67,8 +67,8 @@ class ContactRule:
     points_per_link: int | None
     """1 is the mean of a link's points that count; more are as many of them, spread apart; None is all points."""
     max_contacts: int | None
-    """How many links, the nearest ones, have contacts; where all points are contacts: how many points, first the
-    nearest of every link that touches, then the next of each. None is all."""
+    """The number of links, the nearest ones, that have contacts. Where all points are contacts, the number of points:
+    first the nearest of every link that touches, then the next of each. None is all."""
 
     def contacts(self, raw: RawPoints, links: np.ndarray, xp: ModuleType) -> LinkContacts:
         """The contacts.

@@ -148,7 +148,7 @@ def capsule(address: int) -> Any:
 
 
 def cached(key: str) -> bytes | None:
-    """What was kept under this key, if it is whole; what others could have written is not trusted."""
+    """Read what was kept under this key; None unless it is whole and only this user could have written it."""
     try:
         with open_regular(cache_folder("kernels") / key) as stream:
             content = stream.read()

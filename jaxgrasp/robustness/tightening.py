@@ -158,11 +158,11 @@ def least_effort(
 
 @dataclass(frozen=True)
 class _Tightening(OfPyramids, Audited, ABC):
-    """What the kernels of (21) and (22) share; their results are a solution and, for its audit, evidence."""
+    """The common part of the kernels of (21) and (22), whose results are a solution and evidence for its audit."""
 
     smooth: bool
     evident: bool = True
-    """Whether there is evidence: what nobody looks at is not worth its memory."""
+    """Whether the kernel writes evidence; without an audit nobody reads it."""
 
     @property
     def stages(self) -> tuple:

@@ -120,7 +120,7 @@ def _draw_cone(axes: Any, apex: np.ndarray, normal: np.ndarray, friction: float,
 
 
 def _list_links(axes: Any, links: Sequence[str], numbers: np.ndarray, colours: Sequence[str]) -> None:
-    """Which link each contact is of, a line each at the panel's edge."""
+    """Writes the name of each contact's link at the edge of the panel."""
     for line, number in enumerate(numbers.tolist()):
         colour = colours[number % len(colours)]
         place = (-0.14, 0.92 - 0.045 * line)
