@@ -57,6 +57,8 @@ def hand_on_base(hand: str | PathLike | mujoco.MjSpec, base: str) -> mujoco.MjSp
         out.worldbody.add_body(name=_DRIVER, mocap=True)
         weld = out.add_equality(name=_DRIVER, type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
         weld.name1, weld.name2 = _DRIVER, BASE
+        # Anchor, relative pose (that of the reference) and torque scale: the specification's own has an anchor 1 m off.
+        weld.data[:11] = [0.0] * 10 + [1.0]
     return out
 
 

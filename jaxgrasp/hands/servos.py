@@ -1,0 +1,121 @@
+"""Position servos: those that a hand has, and those that it is given where its file has none."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from jaxgrasp.hands.hand_object import HandObject
+
+# Of a joint that has none, N m s/rad, kg m^2 and N m: those of the Shadow Hand as published with position servos.
+# Without damping and armature MuJoCo's light fingers diverge under servos.
+DAMPING, ARMATURE, FRICTION = 0.05, 0.0002, 0.01
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def with_servos(hand: mujoco.MjSpec, gain: float) -> tuple[mujoco.MjSpec, str]:
+    """A copy of a hand in which every joint that no position servo moves has one.
+
+    Motors become servos of their joint or tendon, with what they can exert as limit; joints on which nothing acts get a
+    servo of their own, unless they follow another joint. Joints get damping, armature and dry friction where they have
+    none: `DAMPING`, `ARMATURE`, `FRICTION`.
+
+    Args:
+        hand: The hand.
+        gain: Of the servos, N m/rad.
+
+    Returns:
+        The hand, and what was added, in a line.
+
+    Raises:
+        ValueError: The hand cannot be compiled, has a sliding joint without an actuator, for which the gain has no
+            unit, or has nothing but position servos already.
+    """
+    spec = hand.copy()
+    model = spec.compile()
+    motors = [a for a in range(model.nu) if not _is_servo(model, a)]
+    for number in motors:
+        _make_servo(spec.actuators[number], model, number, gain)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    moment = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    driven = (moment != 0).any(0)
+    couplings = model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
+    followers = set(model.eq_obj1id[couplings & (model.eq_active0 != 0)].tolist())
+    added, poor = [], {"damping": 0, "armature": 0, "dry friction": 0}
+    for number in np.flatnonzero(np.isin(model.jnt_type, (_HINGE, _SLIDE))).tolist():
+        joint, dof = spec.joints[number], int(model.jnt_dofadr[number])
+        if not driven[dof] and number not in followers:
+            if model.jnt_type[number] == _SLIDE:
+                raise ValueError(
+                    f"servo gain: got {gain:g} N m/rad for a hand whose joint {joint.name!r} slides; wanted hinges, or "
+                    "a hand with actuators"
+                )
+            added.append(_add_servo(spec, joint, gain))
+        for name, attribute, least in (
+            ("damping", "damping", DAMPING),
+            ("armature", "armature", ARMATURE),
+            ("dry friction", "frictionloss", FRICTION),
+        ):
+            if getattr(model, f"dof_{attribute}")[dof] == 0 and model.jnt_type[number] == _HINGE:
+                _set(joint, attribute, least)
+                poor[name] += 1
+    if not motors and not added:
+        raise ValueError("servo gain: got one for a hand with position servos; wanted none")
+    units = {"damping": f"{DAMPING:g} N m s/rad", "armature": f"{ARMATURE:g} kg m^2"}
+    units["dry friction"] = f"{FRICTION:g} N m"
+    parts = [f"position servos of {gain:g} N m/rad for {len(added) + len(motors)} joints or motors"]
+    parts += [f"{name} of {units[name]} for {count} joints" for name, count in poor.items() if count]
+    return spec, f"added {', '.join(parts)}"
+
+
+def servo_commands(hand: HandObject) -> Callable[[np.ndarray], np.ndarray]:
+    """What turns wanted lengths of the hand's actuators (*batch, actuators), rad or m, into their commands.
+
+    Raises:
+        ValueError: An actuator, which is named, is no position servo.
+    """
+    own = hand._actuators
+    others = [name for name, slope in zip(hand.actuator_names, own.slope, strict=True) if not slope < 0]
+    if others or not len(own.numbers):
+        what = f"actuators {', '.join(map(repr, others[:3]))} that are no" if others else "no actuators, so no"
+        raise ValueError(f"hand: it has {what} position servos; wanted some, or a servo gain (--servo-gain)")
+    return lambda length: -(own.bias + own.slope * length) / own.gain
+
+
+def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:
+    affine = model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return bool(affine and model.actuator_biasprm[actuator, 1] < 0)
+
+
+def _make_servo(actuator: mujoco.MjsActuator, model: mujoco.MjModel, number: int, gain: float) -> None:
+    """Makes a motor a servo: the gear acts on length and force, so that the joint's gain is its square times ours."""
+    gear = float(model.actuator_gear[number, 0]) or 1.0
+    force, strength = model.actuator_forcerange[number], float(model.actuator_gainprm[number, 0])
+    limits = [force] if model.actuator_forcelimited[number] else []
+    if model.actuator_ctrllimited[number]:
+        limits.append(np.sort(strength * model.actuator_ctrlrange[number]))
+    own = gain / gear**2
+    actuator.gaintype, actuator.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+    actuator.dyntype = mujoco.mjtDyn.mjDYN_NONE
+    actuator.gainprm[:3], actuator.biasprm[:3] = (own, 0, 0), (0, -own, 0)
+    actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    if limits:
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = (max(x[0] for x in limits), min(x[1] for x in limits))
+
+
+def _add_servo(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, gain: float) -> str:
+    servo = spec.add_actuator(name=f"servo-{joint.name}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    servo.gaintype, servo.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+    servo.gainprm[:3], servo.biasprm[:3] = (gain, 0, 0), (0, -gain, 0)
+    return servo.name
+
+
+def _set(joint: mujoco.MjsJoint, attribute: str, value: float) -> None:
+    """Joints have one number, or coefficients of which the first is it."""
+    if np.ndim(getattr(joint, attribute)):
+        getattr(joint, attribute)[0] = value
+    else:
+        setattr(joint, attribute, value)
