@@ -1,5 +1,7 @@
 """Grasps of files with a hand and an object of one's own: one scene a scale."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,10 +12,8 @@ from jaxgrasp.cli.problems import CommandError
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.cli.scene import GivenScene
+    from jaxgrasp.files import GraspSet
     from jaxgrasp.hands import HandObject, Scene
-
-_STAGE = "grasp_qpos"
-_POSE = 7
 
 
 def candidates_of_grasps(
@@ -28,79 +28,96 @@ def candidates_of_grasps(
     from jaxgrasp.cli.report import counting_bar
     from jaxgrasp.ranking.configurations import candidates_of
 
-    tables = [_table(path) for path in options.grasps]
-    scales = [_scales(options, table) for table in tables]
+    assert options.object is not None
+    grasps = grasps_of_files(options.grasps, options.grasp_format, options.scale)
     hands: list[HandObject] = []
     parts, order = [], []
-    starts = np.cumsum([0, *map(len, scales)])
-    assert options.object is not None
-    with counting_bar("finding contacts", int(starts[-1])) as progress:
+    with counting_bar("finding contacts", len(grasps)) as progress:
         done = 0
-        for scale in np.unique(np.concatenate(scales)):
+        for scale in np.unique(grasps.object_scale):
             built = options.built(options.object, float(scale), friction)
-            chosen = []
-            for path, table, own, start in zip(options.grasps, tables, scales, starts, strict=False):
-                rows = np.flatnonzero(own == scale)
-                if len(rows):
-                    chosen.append((path, table, rows, start, _configurations(path, built, table)[rows]))
+            rows = np.flatnonzero(grasps.object_scale == scale)
+            chosen = grasps.take(rows)
+            qpos = configurations(built, chosen)
             hands.append(options.hand_of(built.model, None, max_force))
-            for path, table, rows, start, qpos in chosen:
-                columns = {name: x[rows] for name, x in table.items() if name not in ("joint_names", "obj_scale")}
-                columns |= {"scene": np.full(len(rows), len(hands) - 1), "obj_scale": np.full(len(rows), scale)}
-                parts.append(
-                    candidates_of(
-                        hands[-1],
-                        qpos,
-                        source=str(path),
-                        limited=options.actuators,
-                        columns=columns,
-                        engine=options.engine,
-                        index=rows,
-                    )
+            parts.append(
+                candidates_of(
+                    hands[-1],
+                    qpos,
+                    source="",
+                    limited=options.actuators,
+                    columns=_travelling(chosen) | {"scene": np.full(len(rows), len(hands) - 1)},
+                    engine=options.engine,
                 )
-                order.append(start + rows)
-                done += len(rows)
-                progress(done)
-    found = concatenate(parts)
-    return found.take(np.argsort(np.concatenate(order))), hands
+            )
+            order.append(rows)
+            done += len(rows)
+            progress(done)
+    found = concatenate(parts).take(np.argsort(np.concatenate(order)))
+    files, source, index = _sources(grasps)
+    return replace(found, sources=files, source=source, index=index), hands
 
 
-def _table(path: Path) -> dict[str, np.ndarray]:
-    from jaxgrasp.candidates import CandidateError
-    from jaxgrasp.storage import read_archive
+def grasps_of_files(paths: Sequence[Path], format: str | None, scale: float | None) -> "GraspSet":
+    """Reads grasps of files in any format that is known.
+
+    Args:
+        paths: Files, folders and patterns.
+        format: The format of all of them; None looks at the content.
+        scale: Of the object; None is the files' own.
+
+    Raises:
+        CommandError: A file cannot be used.
+    """
+    from jaxgrasp.files import read_grasps
 
     try:
-        table = read_archive(path)
-    except CandidateError as error:
-        raise CommandError(str(error)) from error
-    count = len(table[_STAGE]) if _STAGE in table and table[_STAGE].ndim else 0
-    if not count:
-        raise CommandError(f"{path}: got fields {', '.join(table) or 'none'}; wanted {_STAGE} (N, 7 + joints)")
-    # What is the same for all grasps, or of another length, does not travel along.
-    return {name: x for name, x in table.items() if name == "joint_names" or (x.ndim and len(x) == count)}
-
-
-def _scales(options: "GivenScene", table: dict[str, np.ndarray]) -> np.ndarray:
-    count = len(table[_STAGE])
-    if options.scale is not None:
-        return np.full(count, options.scale)
-    given = table.get("obj_scale")
-    if given is None or given.ndim != 1 or given.dtype.kind not in "fiu":
-        return np.ones(count)
-    return given.astype(float)
-
-
-def _configurations(path: Path, built: "Scene", table: dict[str, np.ndarray]) -> np.ndarray:
-    stage, names = table[_STAGE], table.get("joint_names")
-    count = len(built.joint_names) if names is None else len(names)
-    if stage.ndim != 2 or stage.shape[1] != _POSE + count or stage.dtype.kind not in "fiu":
-        wanted = ", ".join(built.joint_names if names is None else map(str, names))
-        raise CommandError(
-            f"{path}: {_STAGE}: got {stage.dtype} {stage.shape}; wanted (N, {_POSE + count}): the pose of the base, "
-            f"then {wanted}"
-        )
-    joints = stage[:, _POSE:] if names is None else dict(zip(map(str, names), stage[:, _POSE:].T, strict=True))
-    try:
-        return built.qpos(base=stage[:, :_POSE], joints=joints, object=table.get("obj_pose"))
+        return read_grasps(paths, format).with_scale(scale)
     except ValueError as error:
-        raise CommandError(f"{path}: {error}") from error
+        raise CommandError(_as_option(error)) from error
+
+
+def configurations(built: "Scene", grasps: "GraspSet", stage: str = "grasp") -> np.ndarray:
+    """Configurations (N, nq) of a scene.
+
+    Args:
+        built: A scene of the grasps' hand, and of the object in their scale.
+        grasps: The grasps.
+        stage: Which of their stages.
+
+    Raises:
+        CommandError: The hand has other joints.
+    """
+    file, count = grasps.source[0].rpartition(":")[0], grasps.stages[stage].joints.shape[1]
+    if grasps.joint_names is None and count != len(built.joint_names):
+        names = ", ".join(built.joint_names)
+        raise CommandError(
+            f"{file}: {stage}: got {count} joints without names; wanted {len(built.joint_names)}, those of the hand: "
+            f"{names}"
+        )
+    try:
+        return built.qpos(
+            base=grasps.stages[stage].base, joints=grasps.joints_by_name(stage), object=grasps.object_pose
+        )
+    except ValueError as error:
+        raise CommandError(f"{file}: {error}") from error
+
+
+def _as_option(error: ValueError) -> str:
+    return str(error).replace("format: got", "--grasp-format: got") if str(error).startswith("format:") else str(error)
+
+
+def _travelling(grasps: "GraspSet") -> dict[str, np.ndarray]:
+    """The columns that a table has beside its own."""
+    from jaxgrasp.files.columns import columns_of_grasps
+
+    table = columns_of_grasps(grasps)
+    return {name: column for name, column in table.items() if name != "joint_names"}
+
+
+def _sources(grasps: "GraspSet") -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Files in the order of their first grasps, and for each grasp the number of its file and its row there."""
+    parted = [text.rpartition(":") for text in grasps.source.tolist()]
+    number = {file: k for k, file in enumerate(dict.fromkeys(file for file, _, _ in parted))}
+    source = np.array([number[file] for file, _, _ in parted])
+    return tuple(number), source, np.array([int(row) for _, _, row in parted])

@@ -39,8 +39,12 @@ class GivenScene(HandScene):
     """With --hand: of the object's lengths; None is the grasps' own obj_scale, or 1."""
 
     grasps: tuple[Path, ...] = ()
-    """With --hand: files of grasps, .npz: grasp_qpos (N, 7 + n), pose of the base and joints, and where present
-    obj_pose (N, 7), obj_scale (N,) and joint_names; other columns travel along."""
+    """With --hand: files, folders and patterns of grasps in any format of docs/grasp_files.md; our own is .npz with
+    grasp_qpos (N, 7 + n), pose of the base and joints, and where present obj_pose (N, 7), obj_scale (N,) and
+    joint_names; other columns travel along."""
+
+    grasp_format: str | None = None
+    """The format of --grasps; None looks at the content of each file. A wrong name is answered with all names."""
 
     qpos: Path | None = None
     """With --scene: configurations, .npy (N, nq), or .npz with the field qpos; other columns travel along."""
