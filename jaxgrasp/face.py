@@ -1,5 +1,8 @@
 """The public face: what `import jaxgrasp` offers."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from jaxgrasp import metrics, solvers
 from jaxgrasp.contact import Actuation, Compliance, Contacts, grasp_map, required_wrench
 from jaxgrasp.disturbance import DisturbanceSet
@@ -22,6 +25,12 @@ from jaxgrasp.robustness import (
 )
 from jaxgrasp.solvers.status import Status
 
+if TYPE_CHECKING:
+    from jaxgrasp.evaluation import evaluate
+
+# What needs MuJoCo is imported when it is used.
+_LATER = {"evaluate": "jaxgrasp.evaluation"}
+
 __all__ = [
     "Actuation",
     "Comparison",
@@ -36,6 +45,7 @@ __all__ = [
     "audit",
     "blocking_forces",
     "compare_formulations",
+    "evaluate",
     "formulation_margin",
     "grasp_map",
     "largest_disturbance",
@@ -48,3 +58,9 @@ __all__ = [
     "without_kernels",
     "worst_case",
 ]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LATER[name]), name)

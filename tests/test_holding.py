@@ -159,3 +159,13 @@ def test_pushes_must_be_given_where_nothing_has_weight():
     hand = changed(lambda spec: setattr(spec.option, "gravity", np.zeros(3)))
     with pytest.raises(ValueError, match="push: got None"):
         hold_trials(hand, np.zeros((1, hand.nq)), np.zeros((1, len(hand.actuators))))
+
+
+def test_joints_with_dry_friction_hold_too(grasp):
+    spec = four_fingers("sphere")
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            joint.frictionloss = 0.01
+    rough = HandObject.from_mjcf(spec, "object", contact_distance=1e-3)
+    qpos, squeeze, _ = grasp
+    assert hold_trials(rough, qpos[None], squeeze[None], push=PUSH).held.all()

@@ -99,6 +99,27 @@ def counting_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
+def stoppable_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """The same for work of which Ctrl-C leaves what is done.
+
+    Args:
+        what: What is being done.
+        total: How often.
+
+    Yields:
+        What to call often with how often it was done.
+    """
+    with counting_bar(what, total) as progress:
+
+        def show(done: int) -> None:
+            if done:
+                signals.checkpoint()
+            progress(done)
+
+        yield show
+
+
+@contextlib.contextmanager
 def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
     """Shows a bar on standard error where that is a terminal, with the median and the best margin so far.
 

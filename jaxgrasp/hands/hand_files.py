@@ -34,7 +34,7 @@ def hand_on_base(hand: str | PathLike | mujoco.MjSpec, base: str) -> mujoco.MjSp
     if base not in BASES:
         raise ValueError(f"base: got {base!r}, wanted one of {', '.join(BASES)}")
     name = "the specification" if isinstance(hand, mujoco.MjSpec) else str(hand)
-    spec = hand.copy() if isinstance(hand, mujoco.MjSpec) else read_spec("hand", hand_file(hand))
+    spec = hand_spec(hand)
     try:
         with_absolute_paths(spec)
         for key in list(spec.keys):
@@ -60,6 +60,18 @@ def hand_on_base(hand: str | PathLike | mujoco.MjSpec, base: str) -> mujoco.MjSp
         # Anchor, relative pose (that of the reference) and torque scale: the specification's own has an anchor 1 m off.
         weld.data[:11] = [0.0] * 10 + [1.0]
     return out
+
+
+def hand_spec(hand: str | PathLike | mujoco.MjSpec) -> mujoco.MjSpec:
+    """The specification of a hand; a copy of one that is given.
+
+    Args:
+        hand: An MJCF or URDF file, a specification, or a name that `hand_names.hand_file` knows.
+
+    Raises:
+        ValueError: The hand cannot be read.
+    """
+    return hand.copy() if isinstance(hand, mujoco.MjSpec) else read_spec("hand", hand_file(hand))
 
 
 def read_spec(argument: str, path: Path) -> mujoco.MjSpec:

@@ -1,9 +1,10 @@
 """Position servos: those that a hand has, and those that it is given where its file has none."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from jaxgrasp.hands.hand_object import HandObject
 
@@ -82,6 +83,27 @@ def servo_commands(hand: HandObject) -> Callable[[np.ndarray], np.ndarray]:
         what = f"actuators {', '.join(map(repr, others[:3]))} that are no" if others else "no actuators, so no"
         raise ValueError(f"hand: it has {what} position servos; wanted some, or a servo gain (--servo-gain)")
     return lambda length: -(own.bias + own.slope * length) / own.gain
+
+
+def commands_towards(
+    hand: HandObject, data: mujoco.MjData, goals: Sequence[Float[np.ndarray, " nq"]]
+) -> list[Float[np.ndarray, " actuators"]]:
+    """Commands of the hand's actuators that pull its joints towards configurations.
+
+    Args:
+        hand: The hand, all of whose actuators are position servos.
+        data: Where the hand is; by the transmission there goals become lengths of the actuators.
+        goals: Configurations.
+
+    Raises:
+        ValueError: An actuator is no position servo.
+    """
+    model, command = hand.model, servo_commands(hand)
+    moment, places = np.zeros((model.nu, model.nv)), model.jnt_qposadr[hand.joints]
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    moment = moment[np.ix_(hand.actuators, hand.dofs)]
+    lengths = data.actuator_length[hand.actuators]
+    return [command(lengths + moment @ (goal - data.qpos)[places]) for goal in goals]
 
 
 def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:

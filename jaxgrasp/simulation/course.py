@@ -1,6 +1,6 @@
 """One grasp after the other on a course: approach, squeeze, and loads from the state after the squeeze, in C MuJoCo."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,9 +11,10 @@ from jaxtyping import Float
 from jaxgrasp.hands import HandObject, Scene
 from jaxgrasp.hands.bodies import bodies_below
 from jaxgrasp.hands.hand_files import BASE
-from jaxgrasp.hands.servos import servo_commands
+from jaxgrasp.hands.servos import commands_towards, servo_commands
 from jaxgrasp.simulation.near_figures import Near, NearFigures
 from jaxgrasp.simulation.protocols import DIRECTIONS, Course
+from jaxgrasp.simulation.trial_scene import hand_of
 
 HELD, LOST, INSIDE, DIVERGED, UNUSABLE = "held", "lost", "penetration", "diverged", "not usable"
 OUTCOMES = (HELD, LOST, INSIDE, DIVERGED, UNUSABLE)
@@ -22,7 +23,7 @@ OUTCOMES = (HELD, LOST, INSIDE, DIVERGED, UNUSABLE)
 _ABSURD = 1000.0
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _DIVERGING = [mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC]
-NOT_TRIED = -1
+NOT_TRIED, LOADS = -1, len(DIRECTIONS)
 
 Observer = Callable[[mujoco.MjData, np.ndarray], None]
 """Called after every few steps with the state and the load, N."""
@@ -66,7 +67,7 @@ class CourseTrial:
         Raises:
             ValueError: An actuator is no position servo.
         """
-        hand = scene.hand_object()
+        hand = hand_of(scene)
         servo_commands(hand)
         return cls(course, scene, hand, NearFigures(hand))
 
@@ -98,7 +99,7 @@ class CourseTrial:
         none = (NOT_TRIED,) * len(course.load_directions)
         if course.max_penetration is not None and deepest > course.max_penetration:
             return Outcome(INSIDE, near, np.nan, np.nan, none)
-        observe = observe or (lambda *_: None)
+        observe = observe or _nobody
         try:
             self._squeeze(moving, everything, observe)
             return self._loaded(moving, begun, near, observe)
@@ -114,10 +115,12 @@ class CourseTrial:
         poses = [qpos[base] for qpos in configurations]
         data.mocap_pos[0], data.mocap_quat[0] = poses[0][:3], poses[0][3:]
         mujoco.mj_forward(model, data)
-        commands = self._commands(data, configurations)
-        data.ctrl[:] = commands[0]
-        slow = model.actuator_actadr >= 0
-        data.act[model.actuator_actadr[slow]] = commands[0][slow]
+        own = self.hand.actuators
+        commands = commands_towards(self.hand, data, configurations)
+        data.ctrl[own] = commands[0]
+        # Actuators with a state of their own have reached their commands.
+        slow = model.actuator_actadr[own] >= 0
+        data.act[model.actuator_actadr[own][slow]] = commands[0][slow]
         mujoco.mj_forward(model, data)
         none = np.zeros(3)
         observe(data, none)
@@ -125,24 +128,10 @@ class CourseTrial:
             for share in np.linspace(0, 1, course.commands_per_stage + 1)[1:]:
                 data.mocap_pos[0] = poses[number - 1][:3] + share * (poses[number][:3] - poses[number - 1][:3])
                 data.mocap_quat[0] = _slerp(poses[number - 1][3:], poses[number][3:], share)
-                data.ctrl[:] = commands[number - 1] + share * (commands[number] - commands[number - 1])
+                data.ctrl[own] = commands[number - 1] + share * (commands[number] - commands[number - 1])
                 mujoco.mj_forward(model, data)
                 _step(model, data, course.steps_per_command)
                 observe(data, none)
-
-    def _commands(self, data: mujoco.MjData, configurations: list[np.ndarray]) -> list[np.ndarray]:
-        """Of all stages, by the transmission at the start, where `data` is."""
-        moment = np.zeros((self.scene.model.nu, self.scene.model.nv))
-        mujoco.mju_sparse2dense(
-            moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        )
-        moment, places = moment[:, self.hand.dofs], self.scene.model.jnt_qposadr[self.hand.joints]
-        begun = configurations[0][places]
-        lengths = [data.actuator_length + moment @ (qpos[places] - begun) for qpos in configurations]
-        commands = [np.zeros(self.scene.model.nu) for _ in lengths]
-        for command, length in zip(commands, lengths, strict=True):
-            command[self.hand.actuators] = servo_commands(self.hand)(length[self.hand.actuators])
-        return commands
 
     def _loaded(self, data: mujoco.MjData, begun: np.ndarray, near: Near, observe: Observer) -> Outcome:
         """Each load from the state in which `data` is."""
@@ -167,8 +156,10 @@ class CourseTrial:
             data.xfrc_applied[bodies, :3] = share * force
             held = True
             for _ in range(checks):
-                _step(model, data, steps)
-                observe(data, force)
+                # In short pieces only where somebody looks on; what happens is the same.
+                for piece in _pieces(steps, course.steps_per_command) if observe is not _nobody else (steps,):
+                    _step(model, data, piece)
+                    observe(data, force)
                 delta = _apart(goal, data.qpos[first : first + 7])
                 held = self._stayed(data, delta)
                 if not held:
@@ -190,6 +181,15 @@ class CourseTrial:
         bodies = self.scene.model.geom_bodyid[data.contact.geom[data.contact.dist <= 0]]
         of_object = np.isin(bodies, bodies_below(self.scene.model, self.hand.object_body))
         return bool((of_object.any(-1) & np.isin(bodies, self.hand.bodies).any(-1)).any())
+
+
+def _nobody(*_: object) -> None:
+    """Looks on when nobody does."""
+
+
+def _pieces(steps: int, most: int) -> Iterator[int]:
+    for begun in range(0, steps, most):
+        yield min(most, steps - begun)
 
 
 def _step(model: mujoco.MjModel, data: mujoco.MjData, count: int) -> None:

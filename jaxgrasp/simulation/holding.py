@@ -51,6 +51,7 @@ def hold_trials(
     controls: Float[np.ndarray, "n actuators"],
     *,
     push: ArrayLike | None = None,
+    workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Trials:
     """Squeezes, lets gravity act, and pushes along +-x, +-y, +-z: does the object stay?
@@ -71,6 +72,7 @@ def hold_trials(
         controls: Squeeze commands of `HandObject.actuator_names`, from `HandObject.controls` for example. All other
             actuators of the scene have the commands of its first keyframe, or zero.
         push: N, of every push, scalar or (n,); None is the object's weight.
+        workers: How many threads; None is one for each core.
         progress: Called with the number of grasps done.
 
     Returns:
@@ -87,7 +89,7 @@ def hold_trials(
     for name, array in (("qpos", qpos), ("controls", controls)):
         if array.shape != shapes[name]:
             raise ValueError(f"{name}: got shape {array.shape}, wanted {shapes[name]}, one row a grasp")
-    rollouts = Rollouts(hand)
+    rollouts = Rollouts(hand, workers)
     pushes = _pushes(push, count, float(np.linalg.norm(rollouts.weight)))
     idle, known = _idle_commands(hand, qpos)
     # An actuator without gain has no command that could matter.
@@ -167,13 +169,14 @@ def _pushes(push: ArrayLike | None, count: int, weight: float) -> Float[np.ndarr
 
 def _idle_commands(hand: HandObject, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Commands (n, actuators) that hold configurations without an effort, and which of these are admissible (n,)."""
-    effort, idle, known = np.zeros(len(hand.actuators)), [], []
+    idle, known = [], []
     for first in range(0, len(qpos), _TILE):
         # The last tile is filled up, so that one compilation serves all.
         rows = np.arange(first, first + _TILE) % len(qpos)
         grasps = hand.grasps(qpos[rows])
-        idle.append(np.asarray(hand.controls(grasps, effort)))
+        # Neither the actuators nor what joints bear by themselves, dry friction for example, exert anything.
+        idle.append(np.asarray(hand.controls(grasps, np.zeros(grasps.spring_efforts.shape))))
         known.append(np.isfinite(np.asarray(grasps.required_wrench)).all(-1))
     if not idle:
-        return np.zeros((0, len(effort))), np.zeros(0, bool)
+        return np.zeros((0, len(hand.actuators))), np.zeros(0, bool)
     return np.concatenate(idle)[: len(qpos)], np.concatenate(known)[: len(qpos)]

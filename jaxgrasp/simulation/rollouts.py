@@ -66,8 +66,12 @@ class Rollouts:
     The base of a hand with a free joint stays where it is.
     """
 
-    def __init__(self, hand: HandObject):
+    def __init__(self, hand: HandObject, workers: int | None = None):
         """Prepares the scene.
+
+        Args:
+            hand: The hand and the object.
+            workers: How many threads; None is one for each core.
 
         Raises:
             ValueError: The object has no free joint or is welded to something, or an actuator integrates its command.
@@ -81,7 +85,7 @@ class Rollouts:
         # Forces on the bodies of the object that together act at its centre of mass.
         self._wrench = hand.model.nu + 6 * of_object[:, None] + np.arange(3)
         self._share = (mass / mass.sum())[:, None]
-        self._data = [mujoco.MjData(self.model) for _ in range(os.cpu_count() or 1)]
+        self._data = [mujoco.MjData(self.model) for _ in range(workers or os.cpu_count() or 1)]
         self._rest, self._others = _at_rest(self.model)
         self._centre = _mass_centre(hand)
 
@@ -134,7 +138,7 @@ class Rollouts:
         given[..., : model.nu] = self._others
         farthest, turned = np.zeros(count), np.zeros(count)
         still = Pose(reference.position[:, None], reference.quaternion[:, None])
-        with _quiet(), rollout.Rollout(nthread=len(self._data)) as pool:
+        with quiet(), rollout.Rollout(nthread=len(self._data)) as pool:
             for first in range(0, steps if count else 0, _STEPS):
                 time = model.opt.timestep * np.arange(first, min(first + _STEPS, steps))
                 share = np.clip(time / stage.rise, 0, 1)[:, None]
@@ -241,8 +245,8 @@ def _mass_centre(hand: HandObject) -> Float[np.ndarray, "3"]:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """MuJoCo's warnings, of simulations that diverge, would go to the terminal and a file in the working directory."""
+def quiet() -> Iterator[None]:
+    """Passes over MuJoCo's warnings, of simulations that diverge: they would go to the terminal and to a log file."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:

@@ -1,8 +1,10 @@
 """The scene of a protocol: a hand on a mocap base, an object at a scale, and the protocol's own engine and contacts."""
 
+import warnings
+
 import mujoco
 
-from jaxgrasp.hands import Scene
+from jaxgrasp.hands import HandObject, Scene
 from jaxgrasp.simulation.protocols import Course, Hold
 
 _ENGINE = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone}
@@ -46,6 +48,16 @@ def trial_scene(course: Course | Hold, hand: mujoco.MjSpec, object: str, scale: 
         if course.hand_solimp is not None:
             geom.solimp[:3] = course.hand_solimp
     return Scene(spec=spec, model=spec.compile())
+
+
+def hand_of(scene: Scene, **options) -> HandObject:
+    """The hand and the object of a scene of a protocol; `options` are those of `HandObject.from_mjcf`.
+
+    That margins leave torsional friction out is no news where a protocol asks for it, and is not warned of.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="scene: contacts have condim")
+        return scene.hand_object(**options)
 
 
 def _set_engine(spec: mujoco.MjSpec, course: Course | Hold) -> None:

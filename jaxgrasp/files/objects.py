@@ -1,0 +1,96 @@
+"""Which object each grasp is of, and in which scale: grasps that share a scene, and their configurations in it."""
+
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxgrasp.files.grasp_set import GRASP, GraspSet
+from jaxgrasp.hands import Scene
+from jaxgrasp.storage import FileError
+
+# Folders and files of these names hold the parts of the object that the folder above is named after.
+_PARTS = ("pieces", "mesh", "meshes")
+_MESHES = (".obj", ".stl", ".msh", ".xml", ".mjcf", ".urdf")
+
+
+class Group(NamedTuple):
+    """Grasps of one object in one scale."""
+
+    object: str
+    """As `Scene.build` takes it."""
+    name: str
+    """What it is called."""
+    scale: float
+    rows: Int[np.ndarray, " group"]
+    """Which grasps of the set."""
+
+
+def name_of_object(object: str | PathLike) -> str:
+    """What an object is called: its folder or file, and where that is named `pieces` or `mesh`, the folder above."""
+    path = Path(object)
+    name = path.stem if path.suffix.lower() in _MESHES else path.name
+    return Path(path.absolute()).parent.name if name in _PARTS else name
+
+
+def grouped(grasps: GraspSet, objects: str | PathLike | Sequence[str | PathLike]) -> Iterator[Group]:
+    """Grasps that share a scene, in the order in which scenes come up.
+
+    Args:
+        grasps: The grasps; their scales are known.
+        objects: One that all grasps are of, or several, of which each grasp is of the one that bears the name of its
+            object, of its file, or of the folder of its file.
+
+    Raises:
+        FileError: A grasp is of none of the objects.
+        ValueError: Two objects have the same name.
+    """
+    given = [objects] if isinstance(objects, str | PathLike) else list(objects)
+    names = [name_of_object(each) for each in given]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"object: got two that are called {name!r}; wanted different names")
+    chosen = np.zeros(len(grasps), int)
+    if len(given) > 1:
+        chosen = np.array([_chosen(grasps, row, names) for row in range(len(grasps))])
+    keys = list(zip(chosen.tolist(), grasps.object_scale.tolist(), strict=True))
+    for key in dict.fromkeys(keys):
+        rows = np.array([row for row, own in enumerate(keys) if own == key])
+        yield Group(str(given[key[0]]), names[key[0]], float(key[1]), rows)
+
+
+def configurations(scene: Scene, grasps: GraspSet, stage: str = GRASP) -> Float[np.ndarray, "batch nq"]:
+    """Configurations of a scene: a stage of grasps, and where their object is.
+
+    Args:
+        scene: Of the grasps' hand, and of their object in their scale.
+        grasps: The grasps.
+        stage: Which of their stages.
+
+    Raises:
+        FileError: The hand has other joints.
+    """
+    file, count = grasps.source[0].rpartition(":")[0], grasps.stages[stage].joints.shape[1]
+    if grasps.joint_names is None and count != len(scene.joint_names):
+        wanted = f"{len(scene.joint_names)}, those of the hand: {', '.join(scene.joint_names)}"
+        raise FileError(file, stage, f"{count} joints without names", wanted)
+    own = grasps.stages[stage]
+    try:
+        return scene.qpos(base=own.base, joints=grasps.joints_by_name(stage), object=grasps.object_pose)
+    except ValueError as error:
+        got, _, wanted = str(error).partition(", wanted ")
+        raise FileError(
+            file, stage, got.removeprefix("joints: got "), wanted or "configurations of the hand"
+        ) from error
+
+
+def _chosen(grasps: GraspSet, row: int, names: Sequence[str]) -> int:
+    file = Path(grasps.source[row].rpartition(":")[0])
+    own = str(grasps.object_name[row])
+    for name in (own, name_of_object(own) if own else "", file.stem, file.absolute().parent.name):
+        if name in names:
+            return names.index(name)
+    raise FileError(file, "object_name", repr(own) if own else "none", f"one of {', '.join(names)}")
