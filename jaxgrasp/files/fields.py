@@ -26,7 +26,7 @@ def part(path: Path, table: object, field: str, kind: type | tuple[type, ...] = 
     """
     name = f"{where}{field}"
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    wanted = " or ".join(_WORDS.get(each, each.__name__) for each in kinds)
+    wanted = " or ".join(dict.fromkeys(_WORDS.get(each, each.__name__) for each in kinds))
     if not isinstance(table, Mapping) or field not in table:
         there = ", ".join(printable(key) for key in list(table)[:20]) if isinstance(table, Mapping) else "no fields"
         raise FileError(path, name, f"nothing of this name (there is {there or 'nothing'})", wanted)

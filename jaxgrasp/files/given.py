@@ -4,11 +4,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxgrasp.files.frames import compose, invert, unit
 from jaxgrasp.storage import FileError
+
+if TYPE_CHECKING:
+    from jaxgrasp.hands.hand_frames import HandFrames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,10 +23,13 @@ class Given:
     """Its file or name; None where nobody has said it."""
 
     @cached_property
-    def _frames(self):
+    def _frames(self) -> "HandFrames | None":
+        if self.hand is None:
+            return None
+        # What files of grasps hold takes no MuJoCo to read.
         from jaxgrasp.hands.hand_frames import HandFrames
 
-        return None if self.hand is None else HandFrames.of(self.hand)
+        return HandFrames.of(self.hand)
 
     def base(self, path: Path, poses: np.ndarray, link: str | None = None) -> np.ndarray:
         """Poses of the frame of the hand file's world, from those of a link.
