@@ -67,7 +67,8 @@ def test_joints_go_by_name_and_columns_that_a_file_lacks_are_unknown(tmp_path):
     second["contacts"] = np.ones((3, 2))
     for name, columns in (("a", first), ("b", second), ("c", table(1, 2, ("a", "b", "x"))), ("d", table(1, 3, None))):
         np.savez(tmp_path / f"{name}.npz", **columns)
-    both = read_grasps([tmp_path / "a.npz", tmp_path / "b.npz"])
+    with pytest.warns(UserWarning, match="pregrasp is left out: 1 of 2 files have it"):
+        both = read_grasps([tmp_path / "a.npz", tmp_path / "b.npz"])
     assert both.joint_names == NAMES and set(both.stages) == {"grasp"}
     np.testing.assert_array_equal(both.stages["grasp"].joints[2:], second["grasp_qpos"][:, :6:-1])
     np.testing.assert_array_equal(np.isnan(both.columns["succ_flag"]), [0, 0, 1, 1, 1])
@@ -96,7 +97,7 @@ def test_a_bad_file_is_named_or_passed_over(tmp_path):
     ]
     with pytest.raises(FileError, match="b.npz: got a truncated .npz file"):
         read_grasps(tmp_path)
-    with pytest.raises(ValueError, match="format: got 'nix', wanted one of jaxgrasp"):
+    with pytest.raises(ValueError, match="format: got 'nix', wanted one of .*jaxgrasp"):
         read_grasps(tmp_path, "nix")
-    with pytest.raises(ValueError, match="format: got 'nix', wanted one of jaxgrasp"):
+    with pytest.raises(ValueError, match="format: got 'nix', wanted one of .*jaxgrasp"):
         write_grasps(read_grasps(tmp_path / "a.npz"), tmp_path / "x", "nix")

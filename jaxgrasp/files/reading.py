@@ -1,50 +1,67 @@
 """Files of grasps in, one set of grasps out: the format is looked up by the content of each file."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 
-from jaxgrasp.files.columns import grasps_of_columns
+from jaxgrasp.files.content import read_content
+from jaxgrasp.files.formats import format_of, named
+from jaxgrasp.files.given import Given
 from jaxgrasp.files.grasp_set import GraspSet, concatenate, in_order_of
 from jaxgrasp.files.paths import grasp_files
-from jaxgrasp.storage import FileError, read_archive
-
-FORMATS = ("jaxgrasp",)
-"""Names of the formats that are read."""
+from jaxgrasp.storage import FileError
 
 
 def read_grasps(
     paths: str | PathLike | Sequence[str | PathLike],
     format: str | None = None,
     *,
+    hand: str | PathLike | None = None,
     skipped: Callable[[FileError], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> GraspSet:
     """Reads grasps of files in any of the formats that are known; nothing in a file is ever run.
 
     Args:
         paths: Files, folders and patterns, see `paths.grasp_files`.
         format: One of `FORMATS`; None looks at the content of each file.
+        hand: The hand's file or name, for formats that tell poses of a link of it, or joints without names.
         skipped: Called with what is wrong with a file, which is then passed over; None raises it.
+        progress: Called after each file with how many are done, and how many there are.
 
     Returns:
         The grasps of all files, in their order.
 
     Raises:
         FileError: A file cannot be used, or the files do not go together, or there is none.
-        ValueError: The format is unknown.
+        ValueError: The format is unknown, or the hand cannot be read.
     """
-    if format is not None and format not in FORMATS:
-        raise ValueError(f"format: got {format!r}, wanted one of {', '.join(FORMATS)}")
-    given = [paths] if isinstance(paths, str | PathLike) else list(paths)
+    chosen = None if format is None else named(format)
+    given = Given(hand=hand)
+    words = [paths] if isinstance(paths, str | PathLike) else list(paths)
     parts: list[GraspSet] = []
-    for path in grasp_files(map(Path, given)):
+    files = grasp_files(map(Path, words))
+    for number, path in enumerate(files):
         try:
-            part = grasps_of_columns(path, read_archive(path))
+            content = read_content(path)
+            part = (chosen or format_of(content)).read(content, given)
             parts.append(in_order_of(parts[0], part) if parts else part)
         except FileError as error:
             if skipped is None:
                 raise
             skipped(error)
+        if progress is not None:
+            progress(number + 1, len(files))
     if not parts:
-        raise FileError(", ".join(map(str, given)) or "grasps", None, "no grasps at all", "files of grasps")
+        raise FileError(", ".join(map(str, words)) or "grasps", None, "no grasps at all", "files of grasps")
+    _tell_of_stages(parts)
     return concatenate(parts)
+
+
+def _tell_of_stages(parts: list[GraspSet]) -> None:
+    """Warns of stages that some files do not have, since all grasps have the same ones."""
+    for stage in dict.fromkeys(name for part in parts for name in part.stages):
+        having = sum(stage in part.stages for part in parts)
+        if having < len(parts):
+            warnings.warn(f"jaxgrasp: {stage} is left out: {having:,} of {len(parts):,} files have it", stacklevel=3)

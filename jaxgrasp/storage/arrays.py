@@ -327,7 +327,7 @@ def array_of_bytes(path: Path | str, name: str | None, header: Header, data: np.
     array = np.ndarray(header.shape[::-1] if header.fortran_order else header.shape, header.dtype, data)
     if array.dtype.kind == "b":
         # Truth values may be written as any byte; arithmetic knows 0 and 1.
-        array = data.reshape(array.shape) != 0
+        array = np.asarray(data.reshape(array.shape) != 0)
     if array.dtype.kind == "U" and array.size and array.dtype.itemsize:
         codes = data.view(array.dtype.byteorder.replace("|", "=") + "u4")
         if codes.max() > 0xD7FF and (((codes > 0xD7FF) & (codes < 0xE000)) | (codes > 0x10FFFF)).any():
