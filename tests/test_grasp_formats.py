@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from grasp_samples import COUNT, HAND, JOINTS, OF_LINK, SAMPLES, SCALE, matrices, of_palm, save, scene, truth
 
-from jaxgrasp.files import FORMATS, read_grasps
+from jaxgrasp.files import FORMATS, GraspSet, HandPoses, read_grasps
 from jaxgrasp.files import frames as f
 from jaxgrasp.storage import FileError
 
@@ -249,3 +248,35 @@ def test_files_as_they_are_found():
     rows = np.load(SHARED / "formats" / "dexgraspnet" / "ddg-gd_banana_poisson_002.npy", allow_pickle=True)
     column = net.joint_names.index("robot0:THJ3")
     np.testing.assert_array_equal(net.stages["grasp"].joints[:, column], [r["qpos"]["robot0:THJ3"] for r in rows])
+
+
+@pytest.mark.parametrize(
+    ("names", "hand", "wanted"),
+    [
+        (("a", "b"), ("b", "c", "a"), ("b", "a")),
+        (("FFJ4", "THJ1"), ("rh_FFJ4", "rh_WRJ1", "rh_THJ1"), ("rh_FFJ4", "rh_THJ1")),
+        (("rh_FFJ4", "rh_THJ1"), ("FFJ4", "THJ1"), ("FFJ4", "THJ1")),
+        # A left hand's grasps are no right hand's.
+        (("lh_FFJ4", "lh_THJ1"), ("rh_FFJ4", "rh_THJ1"), "joints: got 'lh_FFJ4'"),
+        (("joint_0.0", "joint_13.0"), ("thj1", "ffj0"), ("thj1", "ffj0")),
+        (("thj1", "ffj0"), ("joint_0.0", "joint_13.0"), ("joint_0.0", "joint_13.0")),
+        (("a", "x"), ("a", "b"), "joints: got 'x'; wanted some of the hand's: a, b"),
+        # Named alike, turned otherwise: DexGraspNet's Shadow hand.
+        (("robot0:FFJ3",), ("rh_FFJ4", "rh_FFJ3"), "joints: got 'robot0:FFJ3'"),
+        (None, ("a", "b", "c"), "joints: got 2 joints without names; wanted 3, those of the hand: a, b, c"),
+    ],
+)
+def test_joints_get_the_names_of_the_hand(names, hand, wanted):
+    joints = np.arange(2.0)[None]
+    poses = HandPoses(np.zeros((1, 7)), joints)
+    one = np.ones(1)
+    grasps = GraspSet({"grasp": poses}, names, np.zeros((1, 7)), one, np.array(["mug"]), np.array(["f.npy:0"]), {})
+    if isinstance(wanted, str):
+        with pytest.raises(FileError, match=f"^f.npy: {wanted}"):
+            grasps.for_hand(hand)
+        return
+    found = grasps.for_hand(hand)
+    assert found.joint_names == wanted
+    # Each test that turns the order round names the first joint of the file last in the hand.
+    turned = hand in {("b", "c", "a"), ("thj1", "ffj0"), ("joint_0.0", "joint_13.0")}
+    assert found.stages["grasp"].joints[0].tolist() == ([1.0, 0.0] if turned else [0.0, 1.0])

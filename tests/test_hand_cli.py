@@ -90,10 +90,10 @@ def test_compare_takes_the_same_and_leaves_nothing_out(folder, capsys):
         (["--environment", "shelf"], "environment: got 'shelf', wanted one of the scene's bodies"),
         (
             ["--grasps", "short.npz"],
-            "short.npz: grasp: got 2 joints without names; wanted 4, those of the hand: j0",
+            "short.npz: joints: got 2 joints without names; wanted 4, those of the hand: j0",
         ),
-        (["--grasps", "named.npz"], "named.npz: joints: got 'x', wanted some of j0, j1, j2, j3"),
-        (["--grasps", "none.npz"], "none.npz: got fields qpos; wanted grasp_qpos"),
+        (["--grasps", "named.npz"], "named.npz: joints: got 'x'; wanted some of the hand's: j0, j1, j2, j3"),
+        (["--grasps", "none.npz"], "none.npz: got a file of no format that is known (qpos)"),
         (["--grasps", "nix.npz"], "nix.npz"),
         (["--grasps", "nix*.npz"], "nix*.npz: got a pattern that no file fits"),
         (["--grasp-format", "nix"], "--grasp-format: got 'nix', wanted one of"),

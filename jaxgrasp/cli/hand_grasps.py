@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxgrasp.cli.problems import CommandError
+from jaxgrasp.cli.problems import CommandError, Skipped
+from jaxgrasp.storage import FileError
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -17,9 +18,15 @@ if TYPE_CHECKING:
 
 
 def candidates_of_grasps(
-    options: "GivenScene", friction: float | None, max_force: float | None
+    options: "GivenScene", friction: float | None, max_force: float | None, skipped: Skipped | None = None
 ) -> "tuple[Candidates, list[HandObject]]":
     """The candidates of all files of grasps, in their order, and the scenes that they are of.
+
+    Args:
+        options: The hand, the object and the files.
+        friction: Of every contact; None is the models'.
+        max_force: Of every contact, N.
+        skipped: Told of files that cannot be used; None raises.
 
     Raises:
         CommandError: A file or the scene cannot be used.
@@ -29,7 +36,9 @@ def candidates_of_grasps(
     from jaxgrasp.ranking.configurations import candidates_of
 
     assert options.object is not None
-    grasps = grasps_of_files(options.grasps, options.grasp_format, options.scale)
+    grasps = grasps_of_files(
+        options.grasps, options.grasp_format, hand=options.hand, scale=options.scale, skipped=skipped
+    )
     hands: list[HandObject] = []
     parts, order = [], []
     with counting_bar("finding contacts", len(grasps)) as progress:
@@ -39,6 +48,8 @@ def candidates_of_grasps(
             rows = np.flatnonzero(grasps.object_scale == scale)
             chosen = grasps.take(rows)
             qpos = configurations(built, chosen)
+            # Tables have no names of joints: theirs are in the hand's order.
+            chosen = chosen.for_hand(built.joint_names)
             hands.append(options.hand_of(built.model, None, max_force))
             parts.append(
                 candidates_of(
@@ -58,23 +69,39 @@ def candidates_of_grasps(
     return replace(found, sources=files, source=source, index=index), hands
 
 
-def grasps_of_files(paths: Sequence[Path], format: str | None, scale: float | None) -> "GraspSet":
-    """Reads grasps of files in any format that is known.
+def grasps_of_files(
+    paths: Sequence[Path],
+    format: str | None = None,
+    *,
+    hand: str | None = None,
+    scale: float | None = None,
+    skipped: Skipped | None = None,
+    option: str = "--grasp-format",
+) -> "GraspSet":
+    """Reads grasps of files in any format that is known, with a bar.
 
     Args:
         paths: Files, folders and patterns.
         format: The format of all of them; None looks at the content.
+        hand: The hand's file or name.
         scale: Of the object; None is the files' own.
+        skipped: Told of files that cannot be used, which are then passed over; None raises what is wrong with the
+            first one.
+        option: The option that says the format.
 
     Raises:
         CommandError: A file cannot be used.
     """
+    from jaxgrasp.cli.report import counting_bar
     from jaxgrasp.files import read_grasps
 
     try:
-        return read_grasps(paths, format).with_scale(scale)
+        with counting_bar("reading grasps", len(paths)) as progress:
+            found = read_grasps(paths, format, hand=hand, skipped=skipped, progress=progress)
+        return found.with_scale(scale)
     except ValueError as error:
-        raise CommandError(_as_option(error)) from error
+        text = str(error)
+        raise CommandError(f"{option}: {text[8:]}" if text.startswith("format: ") else _as_option(text)) from error
 
 
 def configurations(built: "Scene", grasps: "GraspSet", stage: str = "grasp") -> np.ndarray:
@@ -88,23 +115,18 @@ def configurations(built: "Scene", grasps: "GraspSet", stage: str = "grasp") -> 
     Raises:
         CommandError: The hand has other joints.
     """
-    file, count = grasps.source[0].rpartition(":")[0], grasps.stages[stage].joints.shape[1]
-    if grasps.joint_names is None and count != len(built.joint_names):
-        names = ", ".join(built.joint_names)
-        raise CommandError(
-            f"{file}: {stage}: got {count} joints without names; wanted {len(built.joint_names)}, those of the hand: "
-            f"{names}"
-        )
     try:
-        return built.qpos(
-            base=grasps.stages[stage].base, joints=grasps.joints_by_name(stage), object=grasps.object_pose
-        )
+        own = grasps.for_hand(built.joint_names)
+        return built.qpos(base=own.stages[stage].base, joints=own.joints_by_name(stage), object=own.object_pose)
+    except FileError as error:
+        raise CommandError(str(error)) from error
     except ValueError as error:
-        raise CommandError(f"{file}: {error}") from error
+        raise CommandError(f"{grasps.source[0].rpartition(':')[0]}: {error}") from error
 
 
-def _as_option(error: ValueError) -> str:
-    return str(error).replace("format: got", "--grasp-format: got") if str(error).startswith("format:") else str(error)
+def _as_option(text: str) -> str:
+    """What is wrong with the hand, with the option that names it."""
+    return f"--{text}" if text.startswith("hand: ") else text
 
 
 def _travelling(grasps: "GraspSet") -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from jaxgrasp.files.joint_names import renamed
 from jaxgrasp.storage import FileError
 
 GRASP = "grasp"
@@ -86,6 +87,30 @@ class GraspSet:
             file = self.source[unsaid[0]].rpartition(":")[0]
             raise FileError(file, "object_scale", "no scale of the object, which this format does not say", "--scale")
         return self
+
+    def for_hand(self, names: Sequence[str]) -> "GraspSet":
+        """The same grasps with the names that a hand gives their joints, and where there are all in its order.
+
+        Args:
+            names: Of the hand's joints, in the order of its file.
+
+        Raises:
+            FileError: The hand does not have these joints.
+        """
+        file, count = self.source[0].rpartition(":")[0], self.stages[GRASP].joints.shape[1]
+        listed = ", ".join(names)
+        if self.joint_names is None:
+            if count != len(names):
+                got = f"{count} joints without names"
+                raise FileError(file, "joints", got, f"{len(names)}, those of the hand: {listed}")
+            return replace(self, joint_names=tuple(names))
+        try:
+            own = renamed(self.joint_names, names)
+        except LookupError as error:
+            raise FileError(file, "joints", repr(error.args[0]), f"some of the hand's: {listed}") from error
+        order = [own.index(name) for name in names if name in own]
+        stages = {name: HandPoses(stage.base, stage.joints[:, order]) for name, stage in self.stages.items()}
+        return replace(self, stages=stages, joint_names=tuple(own[k] for k in order))
 
     def joints_by_name(self, stage: str = GRASP) -> "dict[str, np.ndarray] | np.ndarray":
         """The joints of a stage as `Scene.qpos` takes them: by name, or as an array where the order is the hand's."""
