@@ -27,9 +27,10 @@ from jaxgrasp.solvers.status import Status
 
 if TYPE_CHECKING:
     from jaxgrasp.evaluation import evaluate
+    from jaxgrasp.squeezing import squeeze_grasps
 
 # What needs MuJoCo is imported when it is used.
-_LATER = {"evaluate": "jaxgrasp.evaluation"}
+_LATER = {"evaluate": "jaxgrasp.evaluation", "squeeze_grasps": "jaxgrasp.squeezing"}
 
 __all__ = [
     "Actuation",
@@ -55,6 +56,7 @@ __all__ = [
     "required_wrench",
     "solvers",
     "specified_disturbances",
+    "squeeze_grasps",
     "without_kernels",
     "worst_case",
 ]

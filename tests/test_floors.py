@@ -30,12 +30,17 @@ FLOORS = {
     "simulation": 5,
     "synthesis": 6,
     "ranking": 6,
+    "squeezing": 6,
     "evaluation": 7,
     "viewer": 8,
     "cli": 9,
 }
 # Packages that only some rooms may import.
-RESERVED = {"mujoco": {"hands", "simulation", "evaluation", "viewer"}, "optax": {"synthesis"}, "llvmlite": {"kernels"}}
+RESERVED = {
+    "mujoco": {"hands", "simulation", "squeezing", "evaluation", "viewer"},
+    "optax": {"synthesis"},
+    "llvmlite": {"kernels"},
+}
 
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path not in (PACKAGE / "__init__.py", PACKAGE / "face.py"))
 

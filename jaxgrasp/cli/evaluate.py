@@ -12,7 +12,7 @@ import tyro
 
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.metrics import metric_names, scores_of
-from jaxgrasp.cli.problems import CommandError, check_options, check_output, write_files
+from jaxgrasp.cli.problems import CommandError, Skipped, check_options, check_output, write_files
 from jaxgrasp.cli.published import Published, one_line_error
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax
 from jaxgrasp.cli.streams import one_line, printing
@@ -92,9 +92,10 @@ class Evaluate(Published):
         configure_jax()
         from jaxgrasp.cli.evaluation_report import print_evaluation
 
-        grasps, failed = self.grasp_set()
+        skipped = Skipped()
+        grasps = self.grasp_set(skipped)
         self._check_columns(grasps)
-        found, lost = self._tried(grasps)
+        found = self._tried(grasps, skipped)
         scores = self._scores(found, names) if names and len(found) else {}
         compared = self._compared(found, scores)
         written, unwritten = self._write(found, scores, compared)
@@ -102,7 +103,7 @@ class Evaluate(Published):
             one_line(f"{signals.word()}: tried {len(found):,} of {len(grasps):,}")
         with printing():
             print_evaluation(found, compared, written)
-        return 130 if found.interrupted else 2 if failed or lost or unwritten else 0
+        return 130 if found.interrupted else 2 if unwritten else skipped.exit_code()
 
     def _check(self) -> None:
         from jaxgrasp.evaluation import TABLE_ENDINGS
@@ -131,15 +132,9 @@ class Evaluate(Published):
                 there = ", ".join(fitting) or "the files have none"
                 raise CommandError(f"--columns {given}: got no such column of numbers; wanted one of: {there}")
 
-    def _tried(self, grasps: "GraspSet") -> "tuple[Evaluation, bool]":
+    def _tried(self, grasps: "GraspSet", skipped: Skipped) -> "Evaluation":
         from jaxgrasp.cli.report import stoppable_bar
         from jaxgrasp.evaluation import evaluate
-
-        lost: list[str] = []
-
-        def skip(message: str) -> None:
-            lost.append(message)
-            one_line(message)
 
         with one_line_error(self), stoppable_bar("trying grasps", len(grasps)) as progress:
             found = evaluate(
@@ -150,7 +145,7 @@ class Evaluate(Published):
                 servo_gain=self.servo_gain,
                 workers=self.workers,
                 progress=progress,
-                skipped=skip if self.keep_going else None,
+                skipped=skipped if self.keep_going else None,
             )
         for line in found.said:
             one_line(line)
@@ -161,7 +156,7 @@ class Evaluate(Published):
                 f"the simulations of {len(diverged):,} grasps diverged and say nothing of them: {some}"
                 f"{' and others' if len(diverged) > _TOLD else ''}"
             )
-        return found, bool(lost)
+        return found
 
     def _scores(self, found: "Evaluation", names: Sequence[str]) -> dict[str, np.ndarray]:
         from jaxgrasp.cli.report import counting_bar

@@ -115,13 +115,12 @@ def configurations(built: "Scene", grasps: "GraspSet", stage: str = "grasp") -> 
     Raises:
         CommandError: The hand has other joints.
     """
+    from jaxgrasp.files.objects import configurations
+
     try:
-        own = grasps.for_hand(built.joint_names)
-        return built.qpos(base=own.stages[stage].base, joints=own.joints_by_name(stage), object=own.object_pose)
+        return configurations(built, grasps, stage)
     except FileError as error:
         raise CommandError(str(error)) from error
-    except ValueError as error:
-        raise CommandError(f"{grasps.source[0].rpartition(':')[0]}: {error}") from error
 
 
 def _as_option(text: str) -> str:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxgrasp.cli.problems import CommandError, check_options
+from jaxgrasp.cli.problems import CommandError, Skipped, check_options
 from jaxgrasp.cli.setting import Reading
-from jaxgrasp.cli.streams import one_line
 
 if TYPE_CHECKING:
     from jaxgrasp.files import GraspSet
@@ -73,34 +72,29 @@ class Published(Reading):
             ),
         )
 
-    def grasp_set(self) -> "tuple[GraspSet, bool]":
+    def grasp_set(self, skipped: Skipped) -> "GraspSet":
         """Reads the grasps.
 
-        Returns:
-            The grasps, and whether files were passed over.
+        Args:
+            skipped: Told of files that cannot be used, with --keep-going.
 
         Raises:
             CommandError: A file cannot be used.
         """
-        from jaxgrasp.files import read_grasps
+        from jaxgrasp.cli.hand_grasps import grasps_of_files
         from jaxgrasp.files.objects import name_of_object
 
-        skipped: list[ValueError] = []
-
-        def skip(error: ValueError) -> None:
-            skipped.append(error)
-            one_line(error)
-
-        try:
-            read = read_grasps(self.grasps, self.grasp_format, skipped=skip if self.keep_going else None)
-            names = [name_of_object(each) for each in self.object]
-            for name in names:
-                if names.count(name) > 1:
-                    raise CommandError(f"--object: got two that are called {name!r}; wanted different names")
-            return read.with_scale(self.scale), bool(skipped)
-        except ValueError as error:
-            text = str(error)
-            raise CommandError(f"--grasp-{text}" if text.startswith("format:") else text) from error
+        names = [name_of_object(each) for each in self.object]
+        for name in names:
+            if names.count(name) > 1:
+                raise CommandError(f"--object: got two that are called {name!r}; wanted different names")
+        return grasps_of_files(
+            self.grasps,
+            self.grasp_format,
+            hand=self.hand,
+            scale=self.scale,
+            skipped=skipped if self.keep_going else None,
+        )
 
 
 @contextlib.contextmanager

@@ -7,10 +7,11 @@ import tyro
 from jaxgrasp.cli.compare import Compare
 from jaxgrasp.cli.evaluate import Evaluate
 from jaxgrasp.cli.rank import Rank
+from jaxgrasp.cli.squeeze import Squeeze
 from jaxgrasp.cli.synthesize import Synthesize
 
 
-def parsed(arguments: Sequence[str] | None) -> Compare | Evaluate | Rank | Synthesize:
+def parsed(arguments: Sequence[str] | None) -> Compare | Evaluate | Rank | Squeeze | Synthesize:
     """Parses a command line.
 
     Args:
@@ -20,7 +21,7 @@ def parsed(arguments: Sequence[str] | None) -> Compare | Evaluate | Rank | Synth
         SystemExit: Help was asked for and printed, or the options cannot be understood.
     """
     return tyro.extras.subcommand_cli_from_dict(
-        {"rank": Rank, "synthesize": Synthesize, "compare": Compare, "evaluate": Evaluate},
+        {"rank": Rank, "synthesize": Synthesize, "compare": Compare, "evaluate": Evaluate, "squeeze": Squeeze},
         prog="jaxgrasp",
         description="Robustness of multi-fingered grasps, in batch.",
         args=arguments,

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from jaxgrasp.files import GRASP, GraspSet
 from jaxgrasp.files.objects import Group, configurations, grouped
 from jaxgrasp.hands import Scene
-from jaxgrasp.hands.hand_files import hand_spec
-from jaxgrasp.hands.servos import with_servos
+from jaxgrasp.hands.servos import prepared_hand
 from jaxgrasp.simulation import (
     DIVERGED,
     HELD,
@@ -92,7 +91,7 @@ def evaluate(
     servo_gain: float | None = None,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
-    skipped: Callable[[str], None] | None = None,
+    skipped: Callable[[ValueError], None] | None = None,
 ) -> Evaluation:
     """Tries grasps in C MuJoCo by a named protocol.
 
@@ -187,21 +186,6 @@ def film(
     return trial.scene, frames
 
 
-def prepared_hand(hand: str | PathLike | mujoco.MjSpec, servo_gain: float | None) -> tuple[mujoco.MjSpec, list[str]]:
-    """The hand's specification, with servos where a gain is given, and what was added.
-
-    Raises:
-        ValueError: The hand cannot be read, or no servo can be added.
-    """
-    spec = hand_spec(hand)
-    if servo_gain is None:
-        return spec, []
-    if not (np.isfinite(servo_gain) and servo_gain > 0):
-        raise ValueError(f"servo gain: got {servo_gain}; wanted a finite number of N m/rad above 0")
-    spec, line = with_servos(spec, servo_gain)
-    return spec, [line]
-
-
 def stages_of(scene: Scene, grasps: GraspSet, course: Course | Hold) -> dict[str, np.ndarray]:
     """Configurations (n, nq) of the stages that a course asks for; a stage that is missing is the grasp."""
     names = (course.start, *course.stages) if isinstance(course, Course) else ("squeeze",)
@@ -218,14 +202,14 @@ def _missing(grasps: GraspSet, protocol: Protocol) -> list[str]:
     return [f"the grasps have no {' and no '.join(missing)}: the grasp itself was taken for it"] if missing else []
 
 
-def _prepared(group: Group, skipped: Callable[[str], None] | None, make: Callable[[], object]) -> object | None:
+def _prepared(group: Group, skipped: Callable[[ValueError], None] | None, make: Callable[[], object]) -> object | None:
     """What `make` makes for a group; None where it cannot and that is no reason to stop."""
     try:
         return make()
     except ValueError as error:
         if skipped is None:
             raise
-        skipped(f"{group.name}, scale {group.scale:g}: {error}")
+        skipped(ValueError(f"{group.name}, scale {group.scale:g}: {error}"))
         return None
 
 
@@ -235,7 +219,7 @@ def _on_course(
     course: Course,
     spec: mujoco.MjSpec,
     workers: int,
-    skipped: Callable[[str], None] | None,
+    skipped: Callable[[ValueError], None] | None,
 ) -> Iterator[tuple[int, Outcome | None]]:
     """Row by row as they are done; (-1, None) now and then while one waits."""
     own = threading.local()
@@ -284,7 +268,7 @@ def _on_hold(
     course: Hold,
     spec: mujoco.MjSpec,
     workers: int,
-    skipped: Callable[[str], None] | None,
+    skipped: Callable[[ValueError], None] | None,
 ) -> Iterator[tuple[int, Outcome | None]]:
     """In tiles, each of which runs on all cores."""
     for group in groups:

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 
 from jaxgrasp.candidates import Candidates, concatenate
-from jaxgrasp.evaluation.evaluate import prepared_hand
 from jaxgrasp.files import GraspSet
 from jaxgrasp.files.objects import configurations, grouped
+from jaxgrasp.hands.servos import prepared_hand
 from jaxgrasp.ranking.configurations import candidates_of
 from jaxgrasp.simulation import Protocol, hand_of, trial_scene
 

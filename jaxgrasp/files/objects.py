@@ -73,18 +73,12 @@ def configurations(scene: Scene, grasps: GraspSet, stage: str = GRASP) -> Float[
     Raises:
         FileError: The hand has other joints.
     """
-    file, count = grasps.source[0].rpartition(":")[0], grasps.stages[stage].joints.shape[1]
-    if grasps.joint_names is None and count != len(scene.joint_names):
-        wanted = f"{len(scene.joint_names)}, those of the hand: {', '.join(scene.joint_names)}"
-        raise FileError(file, stage, f"{count} joints without names", wanted)
-    own = grasps.stages[stage]
+    own = grasps.for_hand(scene.joint_names)
     try:
-        return scene.qpos(base=own.base, joints=grasps.joints_by_name(stage), object=grasps.object_pose)
+        return scene.qpos(base=own.stages[stage].base, joints=own.joints_by_name(stage), object=own.object_pose)
     except ValueError as error:
-        got, _, wanted = str(error).partition(", wanted ")
-        raise FileError(
-            file, stage, got.removeprefix("joints: got "), wanted or "configurations of the hand"
-        ) from error
+        file = grasps.source[0].rpartition(":")[0]
+        raise FileError(file, stage, " ".join(str(error).split()), "configurations of the hand") from error
 
 
 def _chosen(grasps: GraspSet, row: int, names: Sequence[str]) -> int:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+_NO_WEIGHT = 1e-15
+
 
 class ContactParameters(NamedTuple):
     """Of one pair of geoms."""
@@ -17,6 +19,10 @@ class ContactParameters(NamedTuple):
     margin: float
     """Contacts push up to this distance, m."""
     condim: int
+    solref: np.ndarray
+    """(2,), MuJoCo's."""
+    solimp: np.ndarray
+    """(5,)."""
 
 
 def hand_object_pairs(
@@ -49,11 +55,14 @@ def hand_object_pairs(
         for pair in ((one, other), (other, one)):
             if pair[0] in of_hand and pair[1] in of_object:
                 condim, margin = model.pair_dim[number], model.pair_margin[number]
-                found[pair] = _parameters(model.pair_friction[number], margin, condim)
+                solver = model.pair_solref[number], model.pair_solimp[number]
+                found[pair] = _parameters(model.pair_friction[number], margin, condim, *solver)
     if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_OVERRIDE):
         # The scene's options count in place of all geoms and pairs.
         option = model.opt
-        found = {pair: _parameters(option.o_friction, option.o_margin, own.condim) for pair, own in found.items()}
+        given = option.o_friction, option.o_margin
+        solver = option.o_solref, option.o_solimp
+        found = {pair: _parameters(*given, own.condim, *solver) for pair, own in found.items()}
     if not found:
         raise ValueError(
             "scene: no geom of the hand can touch a geom of the object; "
@@ -73,12 +82,25 @@ def _combined(model: mujoco.MjModel, a: int, b: int) -> ContactParameters:
     if model.geom_priority[a] != model.geom_priority[b]:
         rows = [a if model.geom_priority[a] > model.geom_priority[b] else b]
     sliding = model.geom_friction[rows, 0].max()
-    return _parameters(np.full(2, sliding), model.geom_margin[[a, b]].sum(), model.geom_condim[rows].max())
+    margin = model.geom_margin[[a, b]].sum()
+    return _parameters(np.full(2, sliding), margin, model.geom_condim[rows].max(), *_solver(model, rows))
 
 
-def _parameters(friction: np.ndarray, margin: float, condim: int) -> ContactParameters:
+def _solver(model: mujoco.MjModel, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Of geoms with the same priority: their weighted mean, or the smaller one of numbers that are stiffnesses."""
+    mix = model.geom_solmix[rows]
+    # Where all weights are zero they count alike.
+    weights = mix / mix.sum() if mix.sum() > _NO_WEIGHT else np.full(len(rows), 1 / len(rows))
+    solref = model.geom_solref[rows]
+    mixed = weights @ solref if (solref[:, 0] > 0).all() else solref.min(0)
+    return mixed, weights @ model.geom_solimp[rows]
+
+
+def _parameters(
+    friction: np.ndarray, margin: float, condim: int, solref: np.ndarray, solimp: np.ndarray
+) -> ContactParameters:
     least, most = coulomb(friction, condim), -coulomb(-friction, condim)
-    return ContactParameters(float(least), float(most), float(margin), int(condim))
+    return ContactParameters(float(least), float(most), float(margin), int(condim), np.array(solref), np.array(solimp))
 
 
 def warn_of_simplifications(model: mujoco.MjModel, found: dict[tuple[int, int], ContactParameters]) -> None:

@@ -1,17 +1,34 @@
 """Position servos: those that a hand has, and those that it is given where its file has none."""
 
 from collections.abc import Callable, Sequence
+from os import PathLike
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from jaxgrasp.hands.hand_files import hand_spec
 from jaxgrasp.hands.hand_object import HandObject
 
 # Of a joint that has none, N m s/rad, kg m^2 and N m: those of the Shadow Hand as published with position servos.
 # Without damping and armature MuJoCo's light fingers diverge under servos.
 DAMPING, ARMATURE, FRICTION = 0.05, 0.0002, 0.01
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def prepared_hand(hand: str | PathLike | mujoco.MjSpec, servo_gain: float | None) -> tuple[mujoco.MjSpec, list[str]]:
+    """The hand's specification, with servos where a gain is given, and what was added.
+
+    Raises:
+        ValueError: The hand cannot be read, or no servo can be added.
+    """
+    spec = hand_spec(hand)
+    if servo_gain is None:
+        return spec, []
+    if not (np.isfinite(servo_gain) and servo_gain > 0):
+        raise ValueError(f"servo gain: got {servo_gain}; wanted a finite number of N m/rad above 0")
+    spec, line = with_servos(spec, servo_gain)
+    return spec, [line]
 
 
 def with_servos(hand: mujoco.MjSpec, gain: float) -> tuple[mujoco.MjSpec, str]:
