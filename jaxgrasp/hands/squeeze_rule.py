@@ -28,6 +28,7 @@ from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.hands.bodies import admissible_configurations
+from jaxgrasp.hands.grasps import HandGrasps
 from jaxgrasp.hands.hand_object import HandObject
 from jaxgrasp.hands.softness import depths
 from jaxgrasp.robustness import largest_disturbance, least_effort
@@ -46,6 +47,8 @@ _STEPS, _SLOTS = 41, 4
 _EDGES = 8
 # Grasps at a time.
 _TILE, _LEAST_TILE = 256, 16
+# Of singular values, and of efforts and lengths beside others.
+_RANK, _NEXT_TO_NOTHING = 1e-9, 1e-9
 # Of a force near half of f_max against balance, where there is no margin.
 _EVEN = 0.3
 
@@ -108,13 +111,18 @@ class Squeezes:
     """`Status` of (21)."""
 
 
-def squeezable(hand: HandObject, qpos: Float[np.ndarray, "n nq"]) -> Squeezable:
+def squeezable(hand: HandObject, qpos: Float[np.ndarray, "n nq"], grasps: HandGrasps | None = None) -> Squeezable:
     """Finds what the rule needs of grasps of one scene.
+
+    Args:
+        hand: The hand and the object.
+        qpos: Their configurations.
+        grasps: Of these, where they are known already.
 
     Raises:
         ValueError: Nothing acts on the hand.
     """
-    grasps = hand.grasps(qpos, "mujoco")
+    grasps = hand.grasps(qpos, "mujoco") if grasps is None else grasps
     own, model = hand._actuators, hand.model
     if grasps.actuation is None or not len(own.numbers):
         raise ValueError("hand: it has no actuators; wanted some, or a servo gain (--servo-gain)")
@@ -194,36 +202,9 @@ def _trimmed(given: Squeezable, slots: int) -> Squeezable:
 
 
 def _squeezes(hand: HandObject, given: Squeezable, closing: np.ndarray | None) -> Squeezes:
-    servo = hand._actuators.slope < 0
-    # Lengths of motors are nothing that they can be sent to.
-    back = np.linalg.pinv(np.swapaxes(np.where(servo, given.transmission, 0), -1, -2), 1e-9)
-    motion = np.einsum("nkv,nvu->nku", given.jacobian[:, :, 2], back)
-    chosen, forces, margin, status = _forces(hand, given, motion)
-    # Made as strong as the contacts and the actuators allow.
-    inverse = np.linalg.pinv(given.transmission, 1e-9)
-    torques = np.einsum("nkav,nka->nv", given.jacobian, forces)
-    forces, torques = (
-        x * s for x, s in zip((forces, torques), _scales(hand, given, forces, inverse, torques), strict=True)
-    )
-    push = -forces[..., 2]
-    weight = (push / hand.max_force).clip(0)
-    levels = weight * (given.softness.shape[-1] - 1)
-    low = np.minimum(levels.astype(int), given.softness.shape[-1] - 2)
-    ends = (np.take_along_axis(given.softness, (low + k)[..., None], -1)[..., 0] for k in (0, 1))
-    depth = (lambda a, b: a + (levels - low) * (b - a))(*ends)
-    # Way.
-    slack = np.einsum("nvu,nvw->nuw", back, back) * _RADIUS**2
-    slack = slack + np.eye(len(servo)) * 1e-9
-    normal = np.einsum("nku,nk,nkw->nuw", motion, weight, motion) + slack
-    way = np.linalg.solve(normal, -np.einsum("nku,nk->nu", motion, weight * (given.gap + depth))[..., None])[..., 0]
-    # Press.
-    effort = np.einsum("nuv,nv->nu", inverse, torques - given.springs)
-    effort = effort + np.sign(effort) * np.minimum(np.abs(effort), given.dry)
-    stiffness = np.where(servo, -hand._actuators.slope, 1)
-    lengths = np.where(servo, way + effort / stiffness, 0)
-    joints = np.einsum("njv,nvu,nu->nj", given.following, back, lengths)
-    command = lambda force, at: np.asarray(hand._actuators.command_for(jnp.asarray(force), jnp.asarray(at)))  # noqa: E731
-    controls = np.where(servo, command(0 * effort, given.lengths + lengths), command(effort, given.lengths))
+    chosen, forces, margin, status = _forces(hand, given)
+    forces = _scales(hand, given, forces)[:, None, None] * forces
+    joints, controls = pressed(hand, given, forces)
     near = chosen.any(-1)
     if closing is not None:
         joints = np.where(near[:, None], joints, closing)
@@ -235,17 +216,75 @@ def _squeezes(hand: HandObject, given: Squeezable, closing: np.ndarray | None) -
         controls=controls,
         points=np.where(given.active[..., None], points, np.nan),
         forces=np.einsum("nab,nkbc,nkc->nka", given.object_rotation, given.frames, forces),
-        torques=torques,
+        torques=_torques(given, forces),
         margin=margin,
         effort=0.5 * (forces**2).sum((-1, -2)),
         status=status,
     )
 
 
-def _forces(
-    hand: HandObject, given: Squeezable, motion: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Contacts that take part, forces (contact frames, N), margins and statuses."""
+def pressed(
+    hand: HandObject, given: Squeezable, forces: Float[np.ndarray, "n contacts 3"]
+) -> tuple[Float[np.ndarray, "n all"], Float[np.ndarray, "n actuators"]]:
+    """Steps 3 and 4: what makes forces arrive.
+
+    Args:
+        hand: The hand.
+        given: What is known of the grasps.
+        forces: f on the object, N, contact frames.
+
+    Returns:
+        How far each of the hand's joints is sent beyond the grasp, rad or m, and commands of the actuators for that.
+    """
+    servo = hand._actuators.slope < 0
+    back = _back(hand, given)
+    motion = _motion(given, back)
+    weight = (-forces[..., 2] / hand.max_force).clip(0)
+    # Way: each contact as deep as it must be to bear its force.
+    depth = _at_levels(given.softness, weight)
+    slack = _RADIUS**2 * np.einsum("nvu,nvw->nuw", back, back) + _NEXT_TO_NOTHING * np.eye(len(servo))
+    normal = np.einsum("nku,nk,nkw->nuw", motion, weight, motion) + slack
+    way = np.linalg.solve(normal, -np.einsum("nku,nk->nu", motion, weight * (given.gap + depth))[..., None])[..., 0]
+    # Press: through the joints' dry friction.
+    effort = np.einsum("nuv,nv->nu", _inverse(given), _torques(given, forces) - given.springs)
+    effort = effort + np.sign(effort) * np.minimum(np.abs(effort), given.dry)
+    lengths = np.where(servo, way + effort / np.where(servo, -hand._actuators.slope, 1), 0)
+    joints = np.einsum("njv,nvu,nu->nj", given.following, back, lengths)
+    command = lambda force, at: np.asarray(hand._actuators.command_for(jnp.asarray(force), jnp.asarray(at)))  # noqa: E731
+    controls = np.where(servo, command(0 * effort, given.lengths + lengths), command(effort, given.lengths))
+    return joints, controls
+
+
+def _back(hand: HandObject, given: Squeezable) -> np.ndarray:
+    """T^+ (n, joints, actuators); lengths of motors are nothing that they can be sent to."""
+    servos = np.where(hand._actuators.slope < 0, given.transmission, 0)
+    return np.linalg.pinv(np.swapaxes(servos, -1, -2), _RANK)
+
+
+def _motion(given: Squeezable, back: np.ndarray) -> np.ndarray:
+    """m_k (n, contacts, actuators)."""
+    return np.einsum("nkv,nvu->nku", given.jacobian[:, :, 2], back)
+
+
+def _inverse(given: Squeezable) -> np.ndarray:
+    return np.linalg.pinv(given.transmission, _RANK)
+
+
+def _torques(given: Squeezable, forces: np.ndarray) -> np.ndarray:
+    return np.einsum("nkav,nka->nv", given.jacobian, forces)
+
+
+def _at_levels(softness: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Depths at shares of f_max, (n, contacts); beyond it those of f_max."""
+    levels = share.clip(0, 1) * (softness.shape[-1] - 1)
+    low = np.minimum(levels.astype(int), softness.shape[-1] - 2)
+    begin, end = (np.take_along_axis(softness, (low + k)[..., None], -1)[..., 0] for k in (0, 1))
+    return begin + (levels - low) * (end - begin)
+
+
+def _forces(hand: HandObject, given: Squeezable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Steps 1 and 2: contacts that take part, forces (contact frames, N), margins and statuses."""
+    motion = _motion(given, _back(hand, given))
     pushes = DisturbanceSet.forces(1.0)
     forces, chosen = np.zeros(given.positions.shape), given.active.copy()
     margin, status = np.zeros(len(chosen)), np.zeros(len(chosen), int)
@@ -295,18 +334,15 @@ def first_to_touch(
     return keep
 
 
-def _scales(
-    hand: HandObject, given: Squeezable, forces: np.ndarray, inverse: np.ndarray, torques: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """How much stronger forces and torques are made: until a contact bears f_max, or an actuator its limit."""
+def _scales(hand: HandObject, given: Squeezable, forces: np.ndarray) -> np.ndarray:
+    """How much stronger forces are made, (n,): until a contact bears f_max, or an actuator its limit."""
     strongest = (-forces[..., 2]).max(-1)
     scale = np.where(strongest > 0, hand.max_force / np.where(strongest > 0, strongest, 1), 0)
-    effort = np.einsum("nuv,nv->nu", inverse, torques)
+    effort = np.einsum("nuv,nv->nu", _inverse(given), _torques(given, forces))
     room = np.where(effort > 0, given.limits[..., 1], given.limits[..., 0])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        most = np.where(np.abs(effort) > 1e-12, room / np.where(effort == 0, 1, effort), np.inf).min(-1).clip(0)
-    scale = np.minimum(scale, most)
-    return scale[:, None, None], scale[:, None]
+    pulls = np.abs(effort) > _NEXT_TO_NOTHING
+    most = np.where(pulls, room / np.where(pulls, effort, 1), np.inf).min(-1, initial=np.inf).clip(0)
+    return np.minimum(scale, most)
 
 
 def _nearest_to_balance(hand: HandObject, given: Squeezable) -> np.ndarray:

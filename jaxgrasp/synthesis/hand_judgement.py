@@ -10,8 +10,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxgrasp.compiling import compiled
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.hands import close_fingers
-from jaxgrasp.hands.squeezing import opened, squeezed
+from jaxgrasp.hands import HandGrasps, HandObject, close_fingers
+from jaxgrasp.hands.squeeze_rule import pressed, squeezable
+from jaxgrasp.hands.squeezing import opened
 from jaxgrasp.hands.surroundings import Surroundings
 from jaxgrasp.robustness import largest_disturbance, least_effort
 from jaxgrasp.solvers.status import Status
@@ -138,8 +139,7 @@ def _judged(
     self_penetration, landmarks = _of_the_hand(qpos, around)
     return {
         "pregrasp": opened(hand, qpos),
-        "squeeze": squeezed(hand, qpos, grasps, hold.actuator_efforts),
-        "controls": hand.controls(grasps, hold.actuator_efforts),
+        **_squeeze(hand, qpos, grasps, hold.forces),
         "contact_points": points,
         "forces": forces,
         "margin": best.margin,
@@ -150,6 +150,18 @@ def _judged(
         "self_penetration": self_penetration,
         "landmarks": landmarks,
     }
+
+
+def _squeeze(hand: HandObject, qpos: Array, grasps: HandGrasps, forces: Array) -> dict[str, np.ndarray]:
+    """Where joints are sent, and the commands for it, by the rule of `squeeze_rule`; without actuators they stay."""
+    qpos, forces = np.array(qpos, float), np.asarray(forces)
+    if grasps.actuation is None or not len(hand.actuators):
+        return {"squeeze": qpos, "controls": np.zeros((len(qpos), 0))}
+    unknown = ~np.isfinite(forces).all((-1, -2))
+    joints, controls = pressed(hand, squeezable(hand, qpos, grasps), np.where(unknown[:, None, None], 0, forces))
+    joints[unknown], controls[unknown] = np.nan, np.nan
+    qpos[:, hand.model.jnt_qposadr[hand.joints]] += joints
+    return {"squeeze": qpos, "controls": controls}
 
 
 @functools.partial(compiled, static_argnums=(1,))
