@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import tyro
 
 from jaxgrasp.cli.compare import Compare
+from jaxgrasp.cli.convert import Convert
 from jaxgrasp.cli.evaluate import Evaluate
 from jaxgrasp.cli.rank import Rank
 from jaxgrasp.cli.squeeze import Squeeze
 from jaxgrasp.cli.synthesize import Synthesize
 
 
-def parsed(arguments: Sequence[str] | None) -> Compare | Evaluate | Rank | Squeeze | Synthesize:
+def parsed(arguments: Sequence[str] | None) -> Compare | Convert | Evaluate | Rank | Squeeze | Synthesize:
     """Parses a command line.
 
     Args:
@@ -21,7 +22,14 @@ def parsed(arguments: Sequence[str] | None) -> Compare | Evaluate | Rank | Squee
         SystemExit: Help was asked for and printed, or the options cannot be understood.
     """
     return tyro.extras.subcommand_cli_from_dict(
-        {"rank": Rank, "synthesize": Synthesize, "compare": Compare, "evaluate": Evaluate, "squeeze": Squeeze},
+        {
+            "rank": Rank,
+            "synthesize": Synthesize,
+            "compare": Compare,
+            "convert": Convert,
+            "squeeze": Squeeze,
+            "evaluate": Evaluate,
+        },
         prog="jaxgrasp",
         description="Robustness of multi-fingered grasps, in batch.",
         args=arguments,

@@ -38,10 +38,10 @@ def read(content: Content, given: Given) -> GraspSet:
         FileError: A field cannot be used, or nobody says where the hand's first link stands.
     """
     path, table = content.path, content.table
+    poses = numbers(path, "robot_pose", table.get("robot_pose"))
     names = joint_names(path, table.get("joint_names"))
     if names is None:
         raise FileError(path, "joint_names", "nothing", "the joints in the order of robot_pose")
-    poses = numbers(path, "robot_pose", table.get("robot_pose"))
     if poses.ndim != 4 or poses.shape[2] < 3 or poses.shape[3] != 7 + len(names) or not poses.size:
         wanted = f"(1, N, 3, {7 + len(names)}): a free base and {', '.join(names)}"
         raise FileError(path, "robot_pose", f"shape {poses.shape}", f"{wanted} (files with an arm are not read)")

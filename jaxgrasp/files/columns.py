@@ -62,7 +62,7 @@ def columns_of_grasps(grasps: GraspSet) -> dict[str, np.ndarray]:
         table["object_name"] = grasps.object_name
     table |= {name: column for name, column in grasps.columns.items() if name not in table}
     if grasps.joint_names is not None:
-        table["joint_names"] = np.array(grasps.joint_names)
+        table["joint_names"] = np.array(grasps.joint_names, dtype=str)
     return table
 
 
@@ -92,6 +92,8 @@ def numbers(path: Path, field: str, value: object) -> np.ndarray:
     Raises:
         FileError: It has anything but numbers.
     """
+    if value is None:
+        raise FileError(path, field, "nothing of this name", "numbers")
     if isinstance(value, np.ndarray | np.generic):
         array = np.asarray(value)
     else:

@@ -5,6 +5,7 @@ joints in the order of the hand's MJCF; `obj_pose` is the object's pose, all in 
 there: twice the grasp less the pre-grasp.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +53,13 @@ def one_row(value: object) -> object:
     return np.array([value]) if isinstance(value, _SCALAR) else value
 
 
-def write(grasps: GraspSet, folder: Path) -> list[str]:
+def write(grasps: GraspSet, folder: Path, progress: Callable[[int], None]) -> list[str]:
     """Writes one file a grasp into a folder: `0.npy`, `1.npy` ..., with as many digits as the last one needs.
+
+    Args:
+        grasps: The grasps.
+        folder: It is made where it is not there.
+        progress: Called after each file with how many are written.
 
     Returns:
         What this format cannot say.
@@ -65,11 +71,14 @@ def write(grasps: GraspSet, folder: Path) -> list[str]:
     table = columns_of_grasps(grasps)
     names = table.pop("joint_names", None)
     paths = table.pop("object_name", np.full(len(grasps), ""))
+    # Whoever reads by name can; others take the order for that of the hand's file.
+    same = {} if names is None else {"joint_names": names.tolist()}
     digits = len(str(max(0, len(grasps) - 1)))
     for row in range(len(grasps)):
         one = {name: _as_stored(name, column[row]) for name, column in table.items()}
-        write_pickled(folder / f"{row:0{digits}}.npy", one | {"obj_path": str(paths[row])})
-    return [] if names is None else ["names of joints (the columns are in the order given)"]
+        write_pickled(folder / f"{row:0{digits}}.npy", one | same | {"obj_path": str(paths[row])})
+        progress(row + 1)
+    return [] if names is None else ["that joints are in another order than in the hand's file (--hand turns them)"]
 
 
 def _as_stored(name: str, value: np.ndarray | np.generic) -> object:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.files.frames import compose, invert, unit
+from jaxgrasp.files.grasp_set import STANDING
 from jaxgrasp.storage import FileError
 
 if TYPE_CHECKING:
@@ -36,24 +37,24 @@ class Given:
 
         Args:
             path: The file, for messages.
-            poses: (N, 7) of the link; quaternions are made unit.
+            poses: (N, 7) of the link.
             link: The link's name, "world" for the world of the hand's file; None for the hand's first one.
 
         Returns:
-            (N, 7). Where nobody has said which hand it is, the link is taken to stand in the world of the hand's file,
-            as that of every URDF file and of the formats' own hands does.
+            (N, 7), the same to the last bit where the link stands in that world. Where nobody has said which hand it
+            is, it is taken to, as that of every URDF file and of the formats' own hands does.
 
         Raises:
             FileError: The hand has no such link, or its joints move it.
             ValueError: The hand cannot be read.
         """
         if self._frames is None:
-            return unit(poses)
+            return poses
         try:
             place = self._frames.pose(link)
         except LookupError as error:
             raise FileError(path, "frame of the hand", error.args[0], "a link that no joint moves") from error
-        return compose(unit(poses), invert(place))
+        return poses if (place == STANDING).all() else compose(unit(poses), invert(place))
 
     def has_link(self, link: str) -> bool:
         """Whether the hand has a link of a name; true where nobody has said which hand it is."""

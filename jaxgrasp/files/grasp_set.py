@@ -112,6 +112,10 @@ class GraspSet:
         stages = {name: HandPoses(stage.base, stage.joints[:, order]) for name, stage in self.stages.items()}
         return replace(self, stages=stages, joint_names=tuple(own[k] for k in order))
 
+    def unnamed(self) -> "GraspSet":
+        """The same grasps without names of joints: their order is then taken for that of the hand's file."""
+        return replace(self, joint_names=None)
+
     def joints_by_name(self, stage: str = GRASP) -> "dict[str, np.ndarray] | np.ndarray":
         """The joints of a stage as `Scene.qpos` takes them: by name, or as an array where the order is the hand's."""
         joints = self.stages[stage].joints
