@@ -159,7 +159,8 @@ def test_of_links_on_one_tendon_the_first_to_touch_counts():
 def test_depths_are_those_at_which_mujoco_comes_to_rest(solref, solimp):
     """A ball on a finger of a heavy hand under forces: inverse weights are then exact."""
     of = f'solref="{" ".join(map(str, solref))}" solimp="{" ".join(map(str, solimp))}"'
-    spec = mujoco.MjSpec.from_string(f"""<mujoco><option timestep="0.001" cone="elliptic" integrator="implicitfast" gravity="0 0 0"/>
+    spec = mujoco.MjSpec.from_string(f"""<mujoco>
+      <option timestep="0.001" cone="elliptic" integrator="implicitfast" gravity="0 0 0"/>
       <worldbody><body name="hand"><joint name="j" type="slide" axis="0 0 1"/>
       <geom name="pad" type="box" size=".1 .1 .01" mass="5" {of}/></body>
       <body name="object" pos="0 0 .03"><freejoint/><geom type="sphere" size=".02" mass=".2" {of}/></body></worldbody>
@@ -196,6 +197,10 @@ def test_the_command(grasps, tmp_path, capsys, monkeypatch):
     back = read_grasps("out/sphere.npz")
     assert set(back.stages) == {"pregrasp", "grasp", "squeeze"} and {"margin", "effort", "status"} <= set(back.columns)
     np.testing.assert_array_equal(back.stages["grasp"].joints, grasps.stages["grasp"].joints)
+    assert main([*call, "--output", "bench", "--format", "dexgraspbench"]) == 0
+    bench = read_grasps("bench/sphere", hand="four_fingers")
+    np.testing.assert_allclose(bench.stages["squeeze"].joints, back.stages["squeeze"].joints, atol=1e-6)
+    capsys.readouterr()
     assert main([*call, "--output", "ball.npz"]) == 2
     assert main([*call, "--output", "out", "--format", "x"]) == 2
     assert main([*call, "--output", "out", "--friction", "-1"]) == 2

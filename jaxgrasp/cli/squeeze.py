@@ -45,10 +45,10 @@ class Squeeze(Published):
     """Links nearer to the object are contacts, m."""
 
     output: Path = Path("squeezed")
-    """A folder, which gets OBJECT.npz for each object, or one file, .npz, for all."""
+    """A folder, which gets OBJECT.npz, or another format's OBJECT, for each object; or one file, .npz, for all."""
 
     format: str = "jaxgrasp"
-    """How to write them. A wrong name is answered with all names."""
+    """How to write them, jaxgrasp or a format of `jaxgrasp convert`. A wrong name is answered with all names."""
 
     def run(self) -> int:
         """Squeezes, writes and prints.
@@ -102,6 +102,7 @@ class Squeeze(Published):
             ("--format", self.format, self.format in WRITTEN, f"one of {', '.join(WRITTEN)}"),
         )
         if self.output.suffix:
+            check_options(("--format", self.format, self.format == "jaxgrasp", "a folder as --output for this format"))
             check_output(self.output, "--output", (_NPZ,), self.inputs)
             return
         try:
@@ -111,20 +112,29 @@ class Squeeze(Published):
             raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
 
     def _write(self, squeezed: "GraspSet") -> tuple[list[Path], bool]:
-        from jaxgrasp.files import write_grasps
-
         if self.output.suffix:
             jobs = [(self.output, squeezed)]
         else:
+            ending = _NPZ if self.format == "jaxgrasp" else ""
             names = list(dict.fromkeys(squeezed.object_name.tolist()))
             own = [squeezed.take(squeezed.object_name == name) for name in names]
-            jobs = [(self.output / f"{name}{_NPZ}", part) for name, part in zip(names, own, strict=True)]
+            jobs = [(self.output / f"{name}{ending}", part) for name, part in zip(names, own, strict=True)]
         for path, _ in jobs:
             if any(path.resolve() == other.resolve() for other in self.inputs):
                 raise CommandError(f"--output {path}: this file is read from; wanted another one")
         return write_files(
-            *((path, lambda path, part=part: write_grasps(part, path, self.format)) for path, part in jobs if len(part))
+            *((path, lambda path, part=part: self._write_one(part, path)) for path, part in jobs if len(part))
         )
+
+    def _write_one(self, squeezed: "GraspSet", path: Path) -> None:
+        from jaxgrasp.files import write_grasps
+
+        try:
+            lost = write_grasps(squeezed, path, self.format, hand=None if self.format == "jaxgrasp" else self.hand)
+        except ValueError as error:
+            raise CommandError(f"--format {self.format}: {error}") from error
+        if lost:
+            one_line(f"{self.format} cannot say: {'; '.join(lost)}")
 
 
 def _print(squeezed: "GraspSet", written: Sequence[Path]) -> None:
