@@ -56,10 +56,11 @@ def grouped(grasps: GraspSet, objects: str | PathLike | Sequence[str | PathLike]
     chosen = np.zeros(len(grasps), int)
     if len(given) > 1:
         chosen = np.array([_chosen(grasps, row, names) for row in range(len(grasps))])
-    keys = list(zip(chosen.tolist(), grasps.object_scale.tolist(), strict=True))
-    for key in dict.fromkeys(keys):
-        rows = np.array([row for row, own in enumerate(keys) if own == key])
-        yield Group(str(given[key[0]]), names[key[0]], float(key[1]), rows)
+    rows: dict[tuple[int, float], list[int]] = {}
+    for row, key in enumerate(zip(chosen.tolist(), grasps.object_scale.tolist(), strict=True)):
+        rows.setdefault(key, []).append(row)
+    for (number, scale), own in rows.items():
+        yield Group(str(given[number]), names[number], scale, np.array(own))
 
 
 def configurations(scene: Scene, grasps: GraspSet, stage: str = GRASP) -> Float[np.ndarray, "batch nq"]:
