@@ -12,7 +12,7 @@ from rich.table import Table
 from jaxgrasp.evaluation import Evaluation, summaries
 
 if TYPE_CHECKING:
-    from jaxgrasp.ranking import MetricComparison
+    from jaxgrasp.ranking import MetricComparison, Prediction
 
 _PLAIN_WIDTH = 160
 _ROWS = 30
@@ -58,16 +58,15 @@ def print_evaluation(found: Evaluation, metrics: "MetricComparison | None", writ
         objects = parts[:-1]
         console.print(f"{sum(part.held > 0 for part in objects):,} of {len(objects):,} objects have a grasp that holds")
     if metrics is not None and metrics.prediction is not None:
-        console.print(_areas(metrics))
+        console.print(_areas(metrics.names, metrics.prediction))
     if written:
         console.print("written: " + ", ".join(map(str, written)), markup=False)
 
 
-def _areas(metrics: "MetricComparison") -> Table:
-    prediction = metrics.prediction
+def _areas(names: Sequence[str], prediction: "Prediction") -> Table:
     table = Table(title="How well metrics tell what holds")
     for name in ("metric", "AUC", "95 %"):
         table.add_column(name, justify="left" if name == "metric" else "right")
-    for name, area, (low, high) in zip(metrics.names, prediction.auc, prediction.interval, strict=True):
+    for name, area, (low, high) in zip(names, prediction.auc, prediction.interval, strict=True):
         table.add_row(escape(name), f"{area:.3f}", f"{low:.3f} .. {high:.3f}")
     return table

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from os import PathLike
+from typing import TypeVar
 
 import mujoco
 import numpy as np
@@ -33,6 +34,7 @@ from jaxgrasp.simulation import (
     trial_scene,
 )
 
+T = TypeVar("T")
 # s between two looks at what is done, in which a caller can stop.
 _PATIENCE = 0.2
 CONTROLS = "squeeze_controls"
@@ -126,10 +128,13 @@ def evaluate(
     found: dict[int, Outcome] = {}
     interrupted = False
     workers = workers or os.cpu_count() or 1
-    run = _on_course if isinstance(protocol.course, Course) else _on_hold
+    if isinstance(protocol.course, Course):
+        outcomes = _on_course(grasps, groups, protocol.course, spec, workers, skipped)
+    else:
+        outcomes = _on_hold(grasps, groups, protocol.course, spec, workers, skipped)
     with quiet():
         try:
-            for row, outcome in run(grasps, groups, protocol.course, spec, workers, skipped):
+            for row, outcome in outcomes:
                 if outcome is not None:
                     found[row] = outcome
                 report(len(found))
@@ -202,7 +207,7 @@ def _missing(grasps: GraspSet, protocol: Protocol) -> list[str]:
     return [f"the grasps have no {' and no '.join(missing)}: the grasp itself was taken for it"] if missing else []
 
 
-def _prepared(group: Group, skipped: Callable[[ValueError], None] | None, make: Callable[[], object]) -> object | None:
+def _prepared(group: Group, skipped: Callable[[ValueError], None] | None, make: Callable[[], T]) -> T | None:
     """What `make` makes for a group; None where it cannot and that is no reason to stop."""
     try:
         return make()
@@ -299,21 +304,21 @@ def _evaluation(
     said: list[str],
     interrupted: bool,
 ) -> Evaluation:
-    array = lambda values, kind=float: np.array(list(values), kind)  # noqa: E731
+    array = lambda values, kind="float": np.array(list(values), np.dtype(kind))  # noqa: E731
     return Evaluation(
         protocol=protocol,
         grasps=grasps,
         object=names,
-        outcome=array((o.outcome for o in outcomes), str),
-        held=array((o.outcome == HELD for o in outcomes), bool),
+        outcome=array((o.outcome for o in outcomes), "str"),
+        held=array((o.outcome == HELD for o in outcomes), "bool"),
         delta_pos=array(o.delta_pos for o in outcomes),
         delta_angle=array(o.delta_angle for o in outcomes),
         penetration=array(o.near.penetration for o in outcomes),
         self_penetration=array(o.near.self_penetration for o in outcomes),
-        contact_number=array((o.near.contact_number for o in outcomes), int),
+        contact_number=array((o.near.contact_number for o in outcomes), "int"),
         contact_distance=array(o.near.contact_distance for o in outcomes),
         contact_consistency=array(o.near.contact_consistency for o in outcomes),
-        loads=array((o.loads for o in outcomes), np.int8).reshape(len(outcomes), LOADS),
+        loads=array((o.loads for o in outcomes), "int8").reshape(len(outcomes), LOADS),
         said=tuple(said),
         interrupted=interrupted,
     )

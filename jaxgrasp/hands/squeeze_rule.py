@@ -208,7 +208,7 @@ def _squeezes(hand: HandObject, given: Squeezable, closing: np.ndarray | None) -
     near = chosen.any(-1)
     if closing is not None:
         joints = np.where(near[:, None], joints, closing)
-    lost = ~near & (closing is None) | ~given.known
+    lost = ~given.known if closing is not None else ~(near & given.known)
     joints[lost], controls[lost] = np.nan, np.nan
     points = np.einsum("nij,nkj->nki", given.object_rotation, given.positions) + given.object_position[:, None]
     return Squeezes(

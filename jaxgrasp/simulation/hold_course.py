@@ -11,7 +11,7 @@ from jaxgrasp.hands.bodies import admissible_configurations
 from jaxgrasp.hands.servos import commands_towards
 from jaxgrasp.simulation.course import DIVERGED, HELD, LOADS, LOST, NOT_TRIED, NOTHING, UNUSABLE, Outcome
 from jaxgrasp.simulation.holding import Trials, hold_trials
-from jaxgrasp.simulation.near_figures import NearFigures
+from jaxgrasp.simulation.near_figures import Near, NearFigures
 from jaxgrasp.simulation.protocols import DIRECTIONS, Hold
 from jaxgrasp.simulation.trial_scene import hand_of
 
@@ -75,7 +75,7 @@ class HoldTrial:
         return np.array(found).reshape(len(grasp), len(self.hand.actuators))
 
 
-def _outcome(trials: Trials, row: int, known: bool, near: object) -> Outcome:
+def _outcome(trials: Trials, row: int, known: bool, near: Near) -> Outcome:
     if not known:
         return Outcome(UNUSABLE, NOTHING, np.nan, np.nan, (NOT_TRIED,) * LOADS)
     tried = np.isfinite(trials.displacement[row])

@@ -3,6 +3,7 @@
 import enum
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -53,8 +54,8 @@ class Judgement:
     squeeze: Float[np.ndarray, "grasps nq"]
     """Where the joints would go under the commands if nothing were in the way; NaN where there are none."""
     controls: Float[np.ndarray, "grasps actuators"]
-    """Commands, in the order of `HandObject.actuator_names`, that squeeze as hard as (22) says; NaN where it has no
-    answer."""
+    """Commands, in the order of `HandObject.actuator_names`, that squeeze as hard as (22) says, through the contacts'
+    softness and dry friction; NaN where it has no answer."""
     contact_points: Float[np.ndarray, "grasps contacts 3"]
     """m, world frame."""
     forces: Float[np.ndarray, "grasps contacts 3"]
@@ -128,7 +129,7 @@ def judged(
 
 def _judged(
     around: Surroundings, qpos: Float[Array, "n nq"], disturbances: DisturbanceSet, squeeze: Float[Array, ""]
-) -> dict[str, Array]:
+) -> dict[str, Any]:
     hand = around.hand
     grasps = hand.grasps(qpos)
     given = {"required_wrench": grasps.required_wrench, "actuation": grasps.actuation}
@@ -152,16 +153,17 @@ def _judged(
     }
 
 
-def _squeeze(hand: HandObject, qpos: Array, grasps: HandGrasps, forces: Array) -> dict[str, np.ndarray]:
+def _squeeze(hand: HandObject, qpos: Array, grasps: HandGrasps, forces: Array) -> dict[str, Any]:
     """Where joints are sent, and the commands for it, by the rule of `squeeze_rule`; without actuators they stay."""
-    qpos, forces = np.array(qpos, float), np.asarray(forces)
+    moved, given_forces = np.array(qpos, float), np.asarray(forces)
     if grasps.actuation is None or not len(hand.actuators):
-        return {"squeeze": qpos, "controls": np.zeros((len(qpos), 0))}
-    unknown = ~np.isfinite(forces).all((-1, -2))
-    joints, controls = pressed(hand, squeezable(hand, qpos, grasps), np.where(unknown[:, None, None], 0, forces))
+        return {"squeeze": moved, "controls": np.zeros((len(moved), 0))}
+    unknown = ~np.isfinite(given_forces).all((-1, -2))
+    known_forces = np.where(unknown.reshape(-1, 1, 1), 0, given_forces)
+    joints, controls = pressed(hand, squeezable(hand, moved, grasps), known_forces)
     joints[unknown], controls[unknown] = np.nan, np.nan
-    qpos[:, hand.model.jnt_qposadr[hand.joints]] += joints
-    return {"squeeze": qpos, "controls": controls}
+    moved[:, hand.model.jnt_qposadr[hand.joints]] += joints
+    return {"squeeze": moved, "controls": controls}
 
 
 @functools.partial(compiled, static_argnums=(1,))

@@ -1,11 +1,13 @@
 """The figure of an evaluation: which grasps hold, how far objects went, and how well metrics tell."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxgrasp.evaluation import Evaluation, summaries
-from jaxgrasp.ranking import MetricComparison
+from jaxgrasp.ranking import MetricComparison, Prediction
 
 _COLOURS = {
     "held": "#228833",
@@ -29,16 +31,17 @@ def figure_of_evaluation(found: Evaluation, metrics: MetricComparison | None = N
     Returns:
         The figure; `write_figure` writes it.
     """
-    tell = metrics is not None and metrics.prediction is not None
+    prediction = None if metrics is None else metrics.prediction
+    tell = metrics is not None and prediction is not None
     figure = Figure(figsize=(12.5, 6.6 + 2.6 * tell), layout="constrained", dpi=150)
     panels = figure.subplots(2 + tell, 2, height_ratios=[1.0, 1.0] + [0.9] * tell)
     _draw_shares(panels[0, 0], found)
     _draw_outcomes(panels[0, 1], found)
     _draw_motion(panels[1, 0], found)
     _draw_penetration(panels[1, 1], found)
-    if tell:
-        _draw_curves(panels[2, 0], metrics)
-        _draw_areas(panels[2, 1], metrics)
+    if metrics is not None and prediction is not None:
+        _draw_curves(panels[2, 0], metrics.names, prediction)
+        _draw_areas(panels[2, 1], metrics.names, prediction)
     for axes in panels.flat:
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
@@ -96,15 +99,14 @@ def _draw_penetration(axes: Axes, found: Evaluation) -> None:
         edges = np.linspace(0, most if most > 0 else 1.0, 25)
         for (name, value), colour in zip(zip(depths, values, strict=True), ("#4477aa", "#ccbb44"), strict=True):
             label = f"{name}: mean {value.mean() if len(value) else 0:.2g} mm"
-            axes.hist(value, bins=edges, color=colour, alpha=0.6, label=label)
+            axes.hist(value, bins=edges.tolist(), color=colour, alpha=0.6, label=label)
         axes.legend(frameon=False, fontsize=8)
     axes.set(xlabel="penetration in the grasp, mm", ylabel="grasps")
     axes.set_title("Penetration", fontsize=10)
 
 
-def _draw_curves(axes: Axes, metrics: MetricComparison) -> None:
-    prediction = metrics.prediction
-    for number, (name, curve) in enumerate(zip(metrics.names, prediction.curves, strict=True)):
+def _draw_curves(axes: Axes, names: Sequence[str], prediction: Prediction) -> None:
+    for number, (name, curve) in enumerate(zip(names, prediction.curves, strict=True)):
         axes.plot(*curve.T, color=f"C{number % 10}", linewidth=1.3, label=name)
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=0.8)
     axes.set(xlabel="share of the failures kept", ylabel="share of the successes kept", xlim=(0, 1), ylim=(0, 1.01))
@@ -112,13 +114,12 @@ def _draw_curves(axes: Axes, metrics: MetricComparison) -> None:
     axes.set_title("How well metrics tell what holds", fontsize=10)
 
 
-def _draw_areas(axes: Axes, metrics: MetricComparison) -> None:
-    prediction = metrics.prediction
-    places = np.arange(len(metrics.names))[::-1]
+def _draw_areas(axes: Axes, names: Sequence[str], prediction: Prediction) -> None:
+    places = np.arange(len(names))[::-1]
     error = np.abs(prediction.interval - prediction.auc[:, None]).T
     axes.errorbar(prediction.auc, places, xerr=error, fmt="none", ecolor="0.4", capsize=3)
     axes.scatter(prediction.auc, places, c=[f"C{k % 10}" for k in range(len(places))], zorder=3)
     axes.axvline(0.5, color="0.7", linewidth=0.8)
-    axes.set_yticks(places, metrics.names)
+    axes.set_yticks(places, names)
     axes.set(xlabel="area under the curve, 95 % interval", ylim=(-0.7, len(places) - 0.3))
     axes.set_title("0.5: no better than chance", fontsize=10)
