@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from grasp_samples import COUNT, HAND, JOINTS, OF_LINK, SAMPLES, SCALE, matrices, of_palm, save, scene, truth
 
-from jaxgrasp.files import FORMATS, GraspSet, HandPoses, read_grasps
-from jaxgrasp.files import frames as f
-from jaxgrasp.storage import FileError
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.assaults.grasp_samples import (  # noqa: E402
+    COUNT,
+    HAND,
+    JOINTS,
+    OF_LINK,
+    SAMPLES,
+    SCALE,
+    matrices,
+    of_palm,
+    save,
+    scene,
+    truth,
+)
+from jaxgrasp.files import FORMATS, GraspSet, HandPoses, read_grasps  # noqa: E402
+from jaxgrasp.files import frames as f  # noqa: E402
+from jaxgrasp.storage import FileError  # noqa: E402
 
 # The rotations of float32 files have rounding of 1e-7; poses are compared as matrices.
 CLOSE = 3e-7
