@@ -61,6 +61,7 @@ def read(content: Content, given: Given) -> GraspSet:
         object_name=np.repeat([each.name for each in things], seeds),
         source=sources(path, len(poses)),
         columns=travelling(others, len(poses)),
+        notes=tuple(each.note for each in things if each.note),
     )
 
 
