@@ -1,4 +1,4 @@
-"""The frames that files of grasps tell poses of, drawn: world, object, the hand file's world, and the hand's first link."""
+"""The frames that files of grasps tell poses of, drawn: world, object, hand file, and the first link of the hand."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ LABELS = {
     "world of the hand's file\n(base)": (base[0], (-150, -20)),
     "first link of the hand\n(what BODex, DexGraspNet, GraspQP, ... tell)": (palm, (-250, 90)),
 }
-for label, (pose, _) in LABELS.items():
+for pose, _ in LABELS.values():
     for axis, color in zip(np.eye(3), ("tab:red", "tab:green", "tab:blue"), strict=True):
         tip = pose[:3] + f.rotate(pose[3:], 0.05 * axis)
         axes.plot(*np.stack([pose[:3], tip]).T, color=color, lw=2.5, zorder=3)

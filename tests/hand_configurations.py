@@ -171,7 +171,9 @@ def case(scene: str, name: str) -> Case:
     """Computed once a process."""
     model = model_of(scene, name)
     qpos = near_contact(model, COUNT, seed=1)
-    hand = HandObject.from_mjcf(model, "object", contact_distance=0.0, points_per_link=None, max_contacts=SLOTS)
+    options = {"contact_distance": 0.0, "points_per_link": None, "max_contacts": SLOTS}
+    # Jacobians of directions that are held would leave out what no actuator bears.
+    hand = HandObject.from_mjcf(model, "object", unreached="free", **options)
     grasps = jax.tree.map(np.asarray, hand.grasps(qpos, "distance"))
     slot = np.nonzero(np.isfinite(grasps.distances))[1]
     return Case(model, qpos, hand, grasps, ours(grasps), slot, by_mujoco(model, qpos))

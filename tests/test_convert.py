@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from grasp_samples import HAND, SAMPLES, matrices, of_palm, truth
 from test_files import same, table
 from test_grasp_formats import need
 
-from jaxgrasp.cli import main
-from jaxgrasp.files import GraspSet, read_grasps, write_grasps
-from jaxgrasp.files import frames as f
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.assaults.grasp_samples import HAND, SAMPLES, matrices, of_palm, truth  # noqa: E402
+from jaxgrasp.cli import main  # noqa: E402
+from jaxgrasp.files import GraspSet, read_grasps, write_grasps  # noqa: E402
+from jaxgrasp.files import frames as f  # noqa: E402
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -99,3 +99,13 @@ def test_wrenches_and_torques_of_contact_forces(scene, name):
     turned = np.einsum("nij,nwj->nwi", this.grasps.object_rotation, wrench.reshape(-1, 2, 3))
     np.testing.assert_allclose(world.sum(1), turned[:, 0], atol=WRENCH)
     np.testing.assert_allclose(moments, turned[:, 1], atol=WRENCH)
+
+
+def test_contacts_do_not_depend_on_whether_the_actuation_is_asked_for():
+    hand = jg.hands.HandObject.from_mjcf(jg.hands.scenes.four_fingers("sphere"), "object")
+    qpos = jg.hands.sample_configurations(hand, 5, seed=3)
+    without, whole = (hand.grasps(qpos, "mujoco", actuation=asked) for asked in (False, True))
+    assert without.actuation is without.joint_stiffness is without.spring_torques is without.spring_efforts is None
+    for name in ("distances", "links", "touching", "penetration", "required_wrench", "object_position"):
+        np.testing.assert_array_equal(getattr(without, name), getattr(whole, name))
+    np.testing.assert_array_equal(without.contacts.positions, whole.contacts.positions)

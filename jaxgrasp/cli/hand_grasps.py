@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli.problems import CommandError, Skipped
+from jaxgrasp.cli.streams import one_line
 from jaxgrasp.storage import FileError
 
 if TYPE_CHECKING:
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from jaxgrasp.cli.scene import GivenScene
     from jaxgrasp.files import GraspSet
     from jaxgrasp.hands import HandObject, Scene
+
+_NOTES = 3
 
 
 def candidates_of_grasps(
@@ -98,6 +101,7 @@ def grasps_of_files(
     try:
         with counting_bar("reading grasps", len(paths)) as progress:
             found = read_grasps(paths, format, hand=hand, skipped=skipped, progress=progress)
+        _tell(found.notes)
         return found.with_scale(scale)
     except ValueError as error:
         text = str(error)
@@ -121,6 +125,14 @@ def configurations(built: "Scene", grasps: "GraspSet", stage: str = "grasp") -> 
         return configurations(built, grasps, stage)
     except FileError as error:
         raise CommandError(str(error)) from error
+
+
+def _tell(notes: Sequence[str]) -> None:
+    """Prints the first few on standard error."""
+    for note in notes[:_NOTES]:
+        one_line(note)
+    if len(notes) > _NOTES:
+        one_line(f"... and {len(notes) - _NOTES:,} more like these")
 
 
 def _as_option(text: str) -> str:

@@ -1,5 +1,6 @@
 """The options by which subcommands take a hand and an object, from one scene or each from its own file."""
 
+import functools
 import math
 import warnings
 from dataclasses import dataclass
@@ -10,6 +11,8 @@ from jaxgrasp.cli.problems import CommandError, check_options
 from jaxgrasp.cli.streams import one_line
 
 if TYPE_CHECKING:
+    import mujoco
+
     from jaxgrasp import hands
     from jaxgrasp.hands import HandObject
 
@@ -18,6 +21,15 @@ BUILT_IN = ("shadow_hand", "four_fingers")
 _OF_BUILT = ("mass", "density", "torsional_friction", "condim", "gravity_vector", "table")
 # Warnings that were printed: scenes of several scales have the same ones.
 _SAID: set[str] = set()
+
+
+@functools.cache
+def _read_hand(name: str) -> "mujoco.MjSpec":
+    """The specification of a hand, read once for the scenes of all scales."""
+    from jaxgrasp.hands.hand_files import read_spec
+    from jaxgrasp.hands.hand_names import hand_file
+
+    return read_spec("hand", hand_file(name))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +148,7 @@ class HandScene:
             raise CommandError(f"--environment: got {len(files)} files; wanted one")
         try:
             return Built.build(
-                hand=self.hand,
+                hand=_read_hand(self.hand),
                 object=object,
                 scale=scale,
                 friction=friction,

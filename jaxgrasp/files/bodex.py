@@ -2,17 +2,18 @@
 
 The pose is that of the first link of its own URDF. DexGraspBench's MJCF files of the same hands have the link elsewhere
 in their worlds: where a hand is given its file says where, otherwise the table below, which is that of the three hands
-that come with BODex. Object and scale are in a scene that `scene_path` names.
+that come with BODex. Object and scale are in a scene that `scene_path` names, or in older files beside the poses.
 """
 
 import numpy as np
 
-from jaxgrasp.files.columns import joint_names, numbers, sources, travelling
+from jaxgrasp.files.columns import joint_names, numbers, per_grasp, sources, travelling
+from jaxgrasp.files.columns import poses as poses_of
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.frames import compose, invert, unit
 from jaxgrasp.files.given import Given
 from jaxgrasp.files.grasp_set import GraspSet, HandPoses
-from jaxgrasp.files.scene_cfg import placed
+from jaxgrasp.files.scene_cfg import Placed, placed
 from jaxgrasp.storage import FileError
 
 NAME = "bodex"
@@ -51,7 +52,7 @@ def read(content: Content, given: Given) -> GraspSet:
     for number, stage in enumerate(_STAGES):
         base = _base(content, given, poses[:, number, :7])
         stages[stage] = HandPoses(base, poses[:, number, 7:])
-    things = [placed(path, name) for name in _scenes(content, scenes)]
+    things = _objects(content, scenes)
     others = {name: _by_seed(value, scenes, seeds) for name, value in table.items() if name != "robot_pose"}
     return GraspSet(
         stages=stages,
@@ -61,6 +62,7 @@ def read(content: Content, given: Given) -> GraspSet:
         object_name=np.repeat([each.name for each in things], seeds),
         source=sources(path, len(poses)),
         columns=travelling(others, len(poses)),
+        notes=tuple(each.note for each in things if each.note),
     )
 
 
@@ -73,6 +75,17 @@ def _base(content: Content, given: Given, poses: np.ndarray) -> np.ndarray:
         got = f"poses of the first link of {hand or 'a hand without a name'}"
         raise FileError(content.path, "robot_pose", got, "the hand, whose file says where that stands: --hand")
     return compose(unit(poses), invert(np.array(root)))
+
+
+def _objects(content: Content, scenes: int) -> list[Placed]:
+    """The object of each scene: where older files say it themselves that is so, otherwise as its scene says."""
+    path, table = content.path, content.table
+    if not ("obj_pose" in table and "obj_scale" in table):
+        return [placed(path, name) for name in _scenes(content, scenes)]
+    pose = poses_of(path, "obj_pose", table["obj_pose"], scenes)
+    scale = per_grasp(path, "obj_scale", table["obj_scale"], scenes)
+    names = _scenes(content, scenes) if "scene_path" in table else [path.parent.name] * scenes
+    return [Placed(names[k], pose[k], float(scale[k])) for k in range(scenes)]
 
 
 def _scenes(content: Content, count: int) -> list[str]:

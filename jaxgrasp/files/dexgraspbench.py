@@ -76,7 +76,8 @@ def write(grasps: GraspSet, folder: Path, progress: Callable[[int], None]) -> li
     digits = len(str(max(0, len(grasps) - 1)))
     for row in range(len(grasps)):
         one = {name: _as_stored(name, column[row]) for name, column in table.items()}
-        write_pickled(folder / f"{row:0{digits}}.npy", one | same | {"obj_path": str(paths[row])})
+        one |= same | {"obj_path": str(paths[row])}
+        write_pickled(folder / f"{row:0{digits}}.npy", one, more_follow=row + 1 < len(grasps))
         progress(row + 1)
     return [] if names is None else ["that joints are in another order than in the hand's file (--hand turns them)"]
 

@@ -5,6 +5,8 @@ pre-grasp is its first row, and the whole of it travels along as `pregrasp_path`
 Contacts (`obj_cpn_w` (n, 6) and others) travel along. Older files have a scene inside.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from jaxgrasp.files.columns import STAGE, grasps_of_columns, poses
@@ -47,11 +49,12 @@ def read(content: Content, given: Given) -> GraspSet:
     if len(stages.get("pregrasp_qpos", "1")) > 1:
         columns["pregrasp_path"] = stages["pregrasp_qpos"][None]
     columns |= {f: one_row(x) for f, x in table.items() if f not in stages and not f.startswith("obj_pose")}
-    return grasps_of_columns(path, columns | _of_object(content))
+    thing, note = _of_object(content)
+    return replace(grasps_of_columns(path, columns | thing), notes=(note,) if note else ())
 
 
-def _of_object(content: Content) -> dict[str, object]:
-    """Pose, scale and name of the object, by the file's own fields before those of the scene."""
+def _of_object(content: Content) -> tuple[dict[str, object], str]:
+    """Pose, scale and name of the object, by the file's own fields before those of the scene, and what was assumed."""
     path, table = content.path, content.table
     named, own = table.get("scene_path"), "obj_pose" in table and "obj_scale" in table
     thing = None
@@ -66,4 +69,4 @@ def _of_object(content: Content) -> dict[str, object]:
         found["obj_pose"] = poses(path, "obj_pose", table["obj_pose"], 1)
     if "obj_scale" in table:
         found["obj_scale"] = uniform(path, "obj_scale", table["obj_scale"])
-    return found | {"object_name": thing.name if thing else path.stem}
+    return found | {"object_name": thing.name if thing else path.stem}, thing.note if thing else ""

@@ -5,6 +5,7 @@ the world of the hand's file, not its first body; the object's frame is that of 
 frames, orders or units is turned where it is read.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -53,6 +54,8 @@ class GraspSet:
     """FILE:ROW that each came from, text."""
     columns: dict[str, np.ndarray]
     """Whatever else files say of each grasp, (N, ...), by name."""
+    notes: tuple[str, ...] = ()
+    """What was assumed where files do not say it, or left out, a line each."""
 
     def __len__(self) -> int:
         """Returns how many grasps there are."""
@@ -64,9 +67,9 @@ class GraspSet:
         Args:
             rows: Numbers or a mask.
         """
-        return GraspSet(
+        return replace(
+            self,
             stages={name: HandPoses(s.base[rows], s.joints[rows]) for name, s in self.stages.items()},
-            joint_names=self.joint_names,
             object_pose=self.object_pose[rows],
             object_scale=self.object_scale[rows],
             object_name=self.object_name[rows],
@@ -85,7 +88,9 @@ class GraspSet:
         unsaid = np.flatnonzero(np.isnan(self.object_scale))
         if len(unsaid):
             file = self.source[unsaid[0]].rpartition(":")[0]
-            raise FileError(file, "object_scale", "no scale of the object, which this format does not say", "--scale")
+            raise FileError(
+                file, "object_scale", "no scale of the object, which this format does not say", "with_scale (--scale)"
+            )
         return self
 
     def for_hand(self, names: Sequence[str]) -> "GraspSet":
@@ -138,7 +143,10 @@ def concatenate(parts: Sequence[GraspSet]) -> GraspSet:
     if not others:
         return first
     parts = [first, *(in_order_of(first, part) for part in others)]
-    shared = [name for name in first.stages if all(name in part.stages for part in others)]
+    having = Counter(name for part in parts for name in part.stages)
+    shared = [name for name in first.stages if having[name] == len(parts)]
+    some = {name: count for name, count in having.items() if count < len(parts)}
+    absent = [f"{name} is left out: {count:,} of {len(parts):,} files have it" for name, count in some.items()]
     columns = list(dict.fromkeys(name for part in parts for name in part.columns))
     return GraspSet(
         stages={
@@ -154,6 +162,7 @@ def concatenate(parts: Sequence[GraspSet]) -> GraspSet:
         object_name=np.concatenate([part.object_name for part in parts]),
         source=np.concatenate([part.source for part in parts]),
         columns={name: joined for name in columns if (joined := _joined(name, parts)) is not None},
+        notes=tuple(dict.fromkeys([*(note for part in parts for note in part.notes), *absent])),
     )
 
 

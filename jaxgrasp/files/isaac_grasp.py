@@ -38,7 +38,7 @@ def read(content: Content, given: Given) -> GraspSet:
         FileError: A field cannot be used, or grasps have other joints than the first one.
     """
     path, table = content.path, content.table
-    version = str(table.get("format_version", "nothing"))
+    version = str(table.get("format_version", "1.0"))
     if version.split(".")[0] != "1":
         raise FileError(path, "format_version", printable(version), "1.0")
     grasps = part(path, table, "grasps")
@@ -47,13 +47,7 @@ def read(content: Content, given: Given) -> GraspSet:
     rows = [part(path, grasps, name, dict, "grasps.") for name in grasps]
     poses = np.concatenate([_pose(path, row, name) for name, row in zip(grasps, rows, strict=True)])
     base = given.base(path, poses, _link(table, given))
-    first = part(path, rows[0], JOINTS[GRASP], dict, "grasps.0.")
-    names = checked_joints(path, JOINTS[GRASP], list(first))
-    stages = {}
-    for stage, field in JOINTS.items():
-        if stage == GRASP or all(field in row for row in rows):
-            values = [part(path, row, field, dict, f"grasps.{k}.") for k, row in enumerate(rows)]
-            stages[stage] = HandPoses(base, stacked(path, field, values, list(first)))
+    names, stages, notes = _joints(path, rows, base)
     columns = {
         name: numbers(path, name, [row[name] for row in rows])
         for name in rows[0]
@@ -71,7 +65,28 @@ def read(content: Content, given: Given) -> GraspSet:
         object_name=np.array([printable(row.get("object_file", name)) for row in rows]),
         source=sources(path, count),
         columns={str(name): column for name, column in columns.items()},
+        notes=notes,
     )
+
+
+def _joints(
+    path: Path, rows: list[dict[str, Any]], base: np.ndarray
+) -> tuple[tuple[str, ...], dict[str, HandPoses], tuple[str, ...]]:
+    """Names of the joints, the stages, and what was assumed where grasps have no joints, or those before it alone."""
+    fields = {stage: field for stage, field in JOINTS.items() if any(field in row for row in rows)}
+    if not fields:
+        return (), {GRASP: HandPoses(base, np.zeros((len(rows), 0)))}, ()
+    given = fields.get(GRASP, JOINTS["pregrasp"])
+    first = list(part(path, rows[0], given, dict, "grasps.0."))
+    names, stages = checked_joints(path, given, first), {}
+    for stage, field in fields.items():
+        if field == given or all(field in row for row in rows):
+            values = [part(path, row, field, dict, f"grasps.{k}.") for k, row in enumerate(rows)]
+            stages[stage] = HandPoses(base, stacked(path, field, values, first))
+    if GRASP in stages:
+        return names, stages, ()
+    note = f"{path}: cspace_position: there is none; fingers are taken to stand as in {given}"
+    return names, {GRASP: stages["pregrasp"], **stages}, (printable(note),)
 
 
 def _pose(path: Path, row: Mapping[str, Any], name: object) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Our own files: `.npz`, Parquet, CSV and HDF5 with the columns of `columns`."""
 
+import re
+
 from jaxgrasp.files.columns import STAGE, grasps_of_columns
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.given import Given
@@ -23,6 +25,6 @@ def read(content: Content, given: Given) -> GraspSet:
     names = table.get("joint_names")
     if content.kind == "table" and getattr(names, "ndim", 0) in (1, 2):
         # A table has a row for every grasp: the same names in each.
-        names = names[0] if names.ndim == 2 else names[0].split(";")
+        names = names[0] if names.ndim == 2 else re.split(r"\s*;\s*|\s+", names[0])
         table["joint_names"] = list(map(str, names))
     return grasps_of_columns(content.path, table)

@@ -1,6 +1,5 @@
 """Files of grasps in, one set of grasps out: the format is looked up by the content of each file."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -31,7 +30,7 @@ def read_grasps(
         progress: Called after each file with how many are done, and how many there are.
 
     Returns:
-        The grasps of all files, in their order.
+        The grasps of all files, in their order; `notes` has what was assumed where files do not say it.
 
     Raises:
         FileError: A file cannot be used, or the files do not go together, or there is none.
@@ -55,13 +54,4 @@ def read_grasps(
             progress(number + 1, len(files))
     if not parts:
         raise FileError(", ".join(map(str, words)) or "grasps", None, "no grasps at all", "files of grasps")
-    _tell_of_stages(parts)
     return concatenate(parts)
-
-
-def _tell_of_stages(parts: list[GraspSet]) -> None:
-    """Warns of stages that some files do not have, since all grasps have the same ones."""
-    for stage in dict.fromkeys(name for part in parts for name in part.stages):
-        having = sum(stage in part.stages for part in parts)
-        if having < len(parts):
-            warnings.warn(f"jaxgrasp: {stage} is left out: {having:,} of {len(parts):,} files have it", stacklevel=3)

@@ -5,8 +5,7 @@ or inside the file of grasps.
 """
 
 import re
-import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -31,6 +30,8 @@ class Placed:
     """(7,) in the world."""
     scale: float
     """Of its file's lengths; NaN where it is not said."""
+    note: str = ""
+    """What was assumed."""
 
 
 def object_of(path: Path, scene: object, where: str = "scene_cfg") -> Placed:
@@ -86,7 +87,7 @@ def object_at(path: Path, name: str) -> Placed | None:
 def placed(path: Path, name: str) -> Placed:
     """The object of a scene that a file of grasps names by a path.
 
-    Where the scene does not lie beside the grasps the object is taken to stand in the world's frame, with a warning.
+    Where the scene does not lie beside the grasps the object is taken to stand in the world's frame, with a note.
 
     Raises:
         FileError: It is there, and cannot be used.
@@ -94,12 +95,9 @@ def placed(path: Path, name: str) -> Placed:
     found = object_at(path, name)
     if found is not None:
         return found
-    warnings.warn(
-        f"jaxgrasp: {path}: scene_path: there is no {printable(name)} beside it; the object is taken to stand in the "
-        "world's frame",
-        stacklevel=2,
-    )
-    return object_called(name)
+    told = object_called(name)
+    note = f"{path}: scene_path: there is no {name} beside it; the object is taken to stand in the world's frame"
+    return replace(told, note=printable(note))
 
 
 def object_called(name: str) -> Placed:

@@ -79,7 +79,7 @@ def _parquet(path: str, budget: int) -> dict[str, np.ndarray]:
         if max(size, 8 * about.num_rows * about.num_columns) > budget or about.num_columns > _COLUMNS:
             raise _Refused("data that are too large or too many (see --read-limit)")
         table = file.read(use_threads=False)
-    return {name: value for name, value in _arrays(table, budget).items() if value is not None}
+    return _joined(table, budget)
 
 
 def _arrays(table, budget: int) -> dict[str, np.ndarray | None]:
@@ -120,6 +120,11 @@ def _csv(path: str, budget: int) -> dict[str, np.ndarray]:
     table = csv.read_csv(path, options, convert_options=csv.ConvertOptions(strings_can_be_null=False))
     if 8 * table.num_rows * table.num_columns > budget or table.num_columns > 10 * _COLUMNS:
         raise _Refused("data that are too large or too many (see --read-limit)")
+    return _joined(table, budget)
+
+
+def _joined(table, budget: int) -> dict[str, np.ndarray]:
+    """The columns, those that are numbered (`grasp_qpos_0`, `grasp_qpos_1` ...) as one array."""
     flat = {name: value for name, value in _arrays(table, budget).items() if value is not None}
     found: dict[str, np.ndarray] = {}
     parts: dict[str, list[str]] = {}

@@ -29,7 +29,7 @@ def read_apart(path: Path, kind: str) -> dict[str, np.ndarray]:
 
     Returns:
         Numbers, truth values and text by name; names of HDF5 have their groups before them (`object/scale`), columns
-        of CSV that are numbered (`grasp_qpos_0` ...) are one array.
+        of tables that are numbered (`grasp_qpos_0` ...) are one array.
 
     Raises:
         FileError: It is damaged, too large, names other files, or its library is not installed.

@@ -9,7 +9,10 @@ from jaxgrasp.records import record
 
 @record
 class HandGrasps:
-    """Grasps of a `HandObject` in a batch of configurations."""
+    """Grasps of a `HandObject` in a batch of configurations.
+
+    Without the actuation, `actuation`, `spring_torques`, `spring_efforts` and `joint_stiffness` are None.
+    """
 
     contacts: Contacts
     """In the object's frame about its centre of mass, those of the nearest links first; active where they touch."""
@@ -31,13 +34,13 @@ class HandGrasps:
     the actuators, then those that joints bear by themselves: dry friction, stops, springs on which nothing else acts.
     The springs' torques are part of all of them; `HandObject.actuator_efforts` takes these out. None where nothing acts
     on the hand."""
-    spring_torques: Float[Array, "*batch joints"]
+    spring_torques: Float[Array, "*batch joints"] | None
     """c, N m or N."""
-    spring_efforts: Float[Array, "*batch efforts"]
+    spring_efforts: Float[Array, "*batch efforts"] | None
     """What these are in the efforts of `actuation`, by which its limits are moved."""
     actuator_lengths: Float[Array, "*batch actuators"]
     """rad or m, from which position servos pull."""
-    joint_stiffness: Float[Array, "*batch joints joints"]
+    joint_stiffness: Float[Array, "*batch joints joints"] | None
     """K, N m/rad or N/m: position servos by their gains, and springs."""
     object_position: Float[Array, "*batch 3"]
     """The object's centre of mass, m, world frame."""

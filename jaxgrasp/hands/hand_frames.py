@@ -20,22 +20,22 @@ class HandFrames:
     """The hand alone, with every link of its file."""
 
     @classmethod
-    def of(cls, hand: str | PathLike) -> "HandFrames":
+    def of(cls, hand: str | PathLike | mujoco.MjSpec) -> "HandFrames":
         """Reads a hand.
 
         Args:
-            hand: An MJCF or URDF file, or a name that `hand_names.hand_file` knows.
+            hand: An MJCF or URDF file, a specification, or a name that `hand_names.hand_file` knows.
 
         Raises:
             ValueError: It cannot be read.
         """
-        spec = read_spec("hand", hand_file(hand))
+        spec = hand.copy() if isinstance(hand, mujoco.MjSpec) else read_spec("hand", hand_file(hand))
         # MuJoCo leaves out links of URDF files that no joint moves, which files of grasps name.
         spec.compiler.fusestatic = False
         try:
             return cls(spec.compile())
         except ValueError as error:
-            raise ValueError(f"hand: {hand} cannot be used: {' '.join(str(error).split())}") from error
+            raise ValueError(f"hand: it cannot be used: {' '.join(str(error).split())}") from error
 
     def pose(self, link: str | None = None) -> np.ndarray:
         """Pose (7,) of a link in the world of the hand's file, m and w first.

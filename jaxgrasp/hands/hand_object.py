@@ -69,7 +69,7 @@ class HandObject:
     _actuators: Actuators
     _mechanics: Mechanics
     _engines: dict[str, Engine] = field(default_factory=dict, init=False)
-    _programs: dict[str, Callable[[jax.Array], HandGrasps]] = field(default_factory=dict, init=False)
+    _programs: dict[tuple[str, bool], Callable[[jax.Array], HandGrasps]] = field(default_factory=dict, init=False)
 
     @classmethod
     def from_mjcf(
@@ -182,13 +182,14 @@ class HandObject:
         """Whether efforts act on the joints in the same way in every configuration."""
         return self._mechanics.constant
 
-    def grasps(self, qpos: ArrayLike, engine: str | None = None) -> HandGrasps:
+    def grasps(self, qpos: ArrayLike, engine: str | None = None, *, actuation: bool = True) -> HandGrasps:
         """What the hand does in a batch of configurations.
 
         Args:
             qpos: (*batch, nq), as MuJoCo lays configurations out: rad, m, and unit quaternions (w, x, y, z).
             engine: What finds the contacts: "mujoco", "distance", which is differentiable and compiled by JAX, or
                 "mjx", compiled, too, for pairs that touch or penetrate. None chooses, see `engine_for`.
+            actuation: Whether to find what the joints can do; False is faster and leaves out what `HandGrasps` says.
 
         Returns:
             The grasps. A configuration that is not finite, or has a quaternion whose norm is not 1 to 0.001, becomes a
@@ -205,16 +206,14 @@ class HandObject:
         name = engine_for(engine, qpos)
         finder = self.engine(name)
         if name == "mujoco":
-            values = np.asarray(qpos, float)
-            check_length(self.model, values.shape)
-            batch = values.shape[:-1]
-            flat = self._found(finder, values.reshape(-1, self.nq), np)
+            qpos = np.asarray(qpos, float)
+            check_length(self.model, qpos.shape)
+            flat = self._found(finder, actuation, qpos.reshape(-1, self.nq), np)
         else:
             qpos = as_float("qpos", qpos, ())
             check_length(self.model, qpos.shape)
-            batch = qpos.shape[:-1]
-            flat = self._program(name)(qpos.reshape(-1, self.nq).astype(jnp.result_type(float)))
-        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), flat)
+            flat = self._program(name, actuation)(qpos.reshape(-1, self.nq).astype(jnp.result_type(float)))
+        return jax.tree.map(lambda x: x.reshape(*qpos.shape[:-1], *x.shape[1:]), flat)
 
     def stops(self, joints: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Which of `joints` lean on their lower stop, and on their upper one, at positions (*batch, joints)."""
@@ -318,22 +317,22 @@ class HandObject:
         """All points where geoms touch or come near, (n, slots, ...)."""
         return self._distances.points(poses)
 
-    def _program(self, name: str) -> Callable[[jax.Array], HandGrasps]:
-        if name not in self._programs:
-            self._programs[name] = compiled(partial(self._in_tiles, self.engine(name)))
-        return self._programs[name]
+    def _program(self, name: str, actuation: bool) -> Callable[[jax.Array], HandGrasps]:
+        if (key := (name, actuation)) not in self._programs:
+            self._programs[key] = compiled(partial(self._in_tiles, self.engine(name), actuation))
+        return self._programs[key]
 
-    def _in_tiles(self, engine: DistanceEngine | MjxEngine, qpos: jax.Array) -> HandGrasps:
+    def _in_tiles(self, engine: DistanceEngine | MjxEngine, actuation: bool, qpos: jax.Array) -> HandGrasps:
         """On CPUs, tiles that stay in the cache; and searches among their lanes do not wait for the slowest of all."""
         count, size = len(qpos), engine.tile
         if count <= size or jax.default_backend() != "cpu":
-            return self._found(engine, qpos, jnp)
+            return self._found(engine, actuation, qpos, jnp)
         tiles = -(-count // size)
         padded = jnp.pad(qpos, [(0, tiles * size - count), (0, 0)], mode="edge")
-        found = lax.map(lambda tile: self._found(engine, tile, jnp), padded.reshape(tiles, size, -1))
+        found = lax.map(lambda tile: self._found(engine, actuation, tile, jnp), padded.reshape(tiles, size, -1))
         return jax.tree.map(lambda x: x.reshape(tiles * size, *x.shape[2:])[:count], found)
 
-    def _found(self, engine: Engine, qpos: Array | np.ndarray, xp: ModuleType) -> HandGrasps:
+    def _found(self, engine: Engine, actuation: bool, qpos: Array | np.ndarray, xp: ModuleType) -> HandGrasps:
         """For (n, nq), by engine `mujoco` in NumPy, by others in JAX's arrays."""
         admissible = admissible_configurations(self.model, qpos, xp)
         safe = xp.where(admissible[:, None], qpos, self.model.qpos0.astype(qpos.dtype))
@@ -350,10 +349,12 @@ class HandObject:
             max_force=self.max_force,
             active=found.active | ~admissible[:, None],
         )
-        joints = safe[:, self.model.jnt_qposadr[self.joints]]
-        moved = xp.asarray(self.moved_bodies)[found.link]
-        frames = xp.asarray(contacts.frames)
-        jacobian = self._mechanics.jacobians(geometry, found.position, moved, frames, rotation, xp)
+        mechanics = dict.fromkeys(("actuation", "spring_torques", "spring_efforts", "joint_stiffness"))
+        if actuation:
+            moved, frames = xp.asarray(self.moved_bodies)[found.link], xp.asarray(contacts.frames)
+            jacobian = self._mechanics.jacobians(geometry, found.position, moved, frames, rotation, xp)
+            joints = safe[:, self.model.jnt_qposadr[self.joints]]
+            mechanics = self._mechanics.actuation(geometry, joints, jacobian, not engine.differentiable, xp)
         weight = wrench_against_weight(self.model, bodies_below(self.model, self.object_body), rotation, xp)
         as_float_array = lambda x: jnp.asarray(x, jnp.result_type(float) if xp is np else qpos.dtype)  # noqa: E731
         return HandGrasps(
@@ -367,7 +368,7 @@ class HandObject:
             actuator_lengths=as_float_array(geometry.lengths),
             object_position=as_float_array(centre),
             object_rotation=as_float_array(rotation),
-            **self._mechanics.actuation(geometry, joints, jacobian, not engine.differentiable, xp),
+            **mechanics,
         )
 
     def engine(self, name: str) -> Engine:

@@ -52,8 +52,8 @@ def candidates_of(
     count = len(qpos)
     parts = []
     for first in range(0, count, TILE):
-        # The last tile is filled up, so that one compilation serves all.
-        rows = np.arange(first, first + min(TILE, count)) % count
+        # The last tile is filled up, so that one compilation serves all, and few serve small batches.
+        rows = np.arange(first, first + min(TILE, 1 << (count - 1).bit_length())) % count
         # What is the same for all is kept once.
         stop = {name: 1 for name in _TRANSMISSION} if hand.constant_transmission else {}
         found = _columns(hand, qpos[rows], limited, engine)
@@ -103,7 +103,7 @@ def trimmed(candidates: Candidates) -> Candidates:
 
 
 def _columns(hand: HandObject, qpos: np.ndarray, limited: bool, engine: str | None) -> dict[str, jax.Array]:
-    grasps = hand.grasps(qpos, engine)
+    grasps = hand.grasps(qpos, engine, actuation=limited)
     columns = {name: getattr(grasps.contacts, name) for name in _CONTACTS}
     columns |= {name: getattr(grasps, name) for name in ("touching", "left_out", "penetration", "required_wrench")}
     if limited and grasps.actuation is not None:

@@ -22,6 +22,8 @@ from jaxgrasp.robustness import largest_disturbance, least_effort
 # some tens of megabytes. Accelerators want more at once.
 TILE = {"cpu": 8192}
 ACCELERATOR_TILE = 131_072
+# So few candidates are solved before fast code would be compiled.
+_FEW = 256
 
 Columns = dict[str, np.ndarray]
 
@@ -117,7 +119,11 @@ def tightening(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str,
     return solution.forces, solution.forces_in_object_frame(contacts), solution.effort, solution.status, controls
 
 
-@functools.partial(compiled, static_argnums=(3, 4, 5, 6))
+def _few(columns: Columns) -> bool:
+    return jax.default_backend() == "cpu" and len(columns["positions"]) <= _FEW
+
+
+@functools.partial(compiled, static_argnums=(3, 4, 5, 6), pace=lambda columns, *_: "soon" if _few(columns) else "fast")
 def _solve_tile(
     columns: Any, disturbances: DisturbanceSet, gravity: Any, solver: Any, cone_edges: int, loaded: bool, mesh: Mesh
 ) -> Any:

@@ -19,6 +19,9 @@ _TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
 _CURVED = {"float64": 1e-10, "float32": 1e-5}
 # Residuals and gaps that did not close to the tolerance still count as solved below this; less than this is zero.
 ACCEPTED = {"float64": 1e-7, "float32": 3e-4}
+# How far forces may miss what they have to answer in the grasp's own rows, of their sum. The programs' rows are
+# orthonormal: where those of G depend on each other nearly, small residuals of the one are large ones of the other.
+_BALANCED = {"float64": 3e-8, "float32": 1e-5}
 
 
 @record
@@ -115,13 +118,19 @@ def formulation_answer(
 ) -> FormulationSolution:
     """The solution of a formulation from the outcome of its programs, with these rows of a contact."""
     directions, upper, status, answered = verdict(grasps, shared, scale, form, out)
-    hide = lambda v: jnp.where(answered, v, jnp.nan)  # noqa: E731
     margin, worst = jnp.min(directions, 0), jnp.argmin(directions, 0)
     upper = jnp.maximum(jnp.min(upper, 0), margin)
     program = worst if scale.shape[0] > 1 else jnp.zeros_like(worst)
     forces, disturbed = _forces(shared, form, out.point.x, directions, margin, program)
     nothing = _unloaded(grasps) & (margin == 0)
-    forces, disturbed = (jnp.where(nothing, 0, x) for x in (forces, disturbed))
+    forces, disturbed = (jnp.where(nothing, 0, x * grasps.present) for x in (forces, disturbed))
+    # What is told of every direction is on the way from f_0 to the most that it allows.
+    attained, reached = disturbed, jnp.broadcast_to(margin, directions.shape)
+    if form.free:
+        attained, reached = jnp.moveaxis(out.point.x, 2, 0)[:-1] * shared.sizes * grasps.present, directions
+    missed = answered & ~_balanced(grasps, shared, forces, attained, reached)
+    status, answered = jnp.where(missed, Status.MAX_ITERATIONS, status), answered & ~missed
+    hide = lambda v: jnp.where(answered, v, jnp.nan)  # noqa: E731
     finite = answered & shared.disturbed.any(0) & ~shared.outside.any(0)
     direction, contact, row = _binding(shared, rows, form, out.point.z, program)
     told = lambda v: jnp.where(finite, v, -1).astype(jnp.int32)  # noqa: E731
@@ -129,8 +138,8 @@ def formulation_answer(
         margin=hide(margin),
         upper_bound=hide(upper),
         directions=hide(directions),
-        forces=hide(jnp.moveaxis(forces * grasps.present, 1, 0)),
-        disturbed_forces=hide(jnp.moveaxis(disturbed * grasps.present, 2, 1)),
+        forces=hide(jnp.moveaxis(forces, 1, 0)),
+        disturbed_forces=hide(jnp.moveaxis(disturbed, 2, 1)),
         status=status,
         direction=told(direction),
         contact=told(contact),
@@ -139,6 +148,23 @@ def formulation_answer(
         primal_residual=hide(jnp.max(jnp.where(out.iterations > 0, out.residual, 0), 0)),
         gap=hide(jnp.where(finite, (upper - margin) / jnp.maximum(_pick(scale, program), margin), 0)),
     )
+
+
+def _balanced(grasps: Grasps, shared: Basics, rest: jax.Array, forces: jax.Array, reached: jax.Array) -> jax.Array:
+    """Whether f_0 (3, n, *lanes) supplies b and forces (n_d, 3, n, *lanes) b - lambda_j W_j, (*lanes).
+
+    Directions without a lambda_j above 0 are not looked at.
+    """
+    there = jnp.isfinite(reached) & (reached > 0)
+    wanted = grasps.wrench - jnp.moveaxis(jnp.where(there, reached, 0) * shared.wrenches, 1, 0)
+    wanted = jnp.concatenate([wanted, grasps.wrench[None]])
+    there = jnp.concatenate([there, jnp.ones_like(there[:1])])
+    supplying = jnp.concatenate([forces, rest[None]])
+    supplied = jnp.einsum("eanl,danl->del", grasps.columns, supplying, precision="highest")
+    sizes = jnp.sqrt((supplying * supplying).sum(1)).sum(1)
+    sizes = jnp.maximum(sizes, jnp.abs(wanted).max(1))
+    right = jnp.abs(supplied - wanted).max(1) <= _BALANCED[forces.dtype.name] * sizes
+    return (right | ~there).all(0)
 
 
 def _unloaded(grasps: Grasps) -> jax.Array:

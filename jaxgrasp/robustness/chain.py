@@ -58,6 +58,8 @@ class Basics:
     """(6, 3, n, *lanes), the orthonormal rows of G for scaled forces; zero where dropped."""
     dropped: jax.Array
     """(6, *lanes), 1 where a row was dropped."""
+    wrenches: jax.Array
+    """(6, n_d, *lanes), W_j in the units of G's rows."""
     load: jax.Array
     """(6, *lanes), b in the orthonormal rows."""
     targets: jax.Array
@@ -111,6 +113,7 @@ def basics(grasps: Grasps, with_answers: bool) -> Basics:
         sizes=sizes,
         columns=rows.rows,
         dropped=1 - rows.kept,
+        wrenches=wrenches,
         load=load,
         targets=targets,
         answers=blocking(grasps, wrenches) if with_answers else None,

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from torch_sample import torch_file
+
+from benchmarks.assaults.torch_sample import torch_file
 
 COUNT = 4
 JOINTS = ("a", "b", "c")
