@@ -112,7 +112,8 @@ def test_rows_without_a_configuration_harm_no_neighbour(grasps, found):
     base[2] = np.nan
     broken = GraspSet(**{**vars(grasps), "stages": {**grasps.stages, "grasp": HandPoses(base, poses.joints)}})
     other = jg.squeeze_grasps(broken, hand="four_fingers", object="sphere", max_force=4.0)
-    assert np.isnan(other.stages["squeeze"].joints[2]).all()
+    assert np.isnan(other.stages["squeeze"].joints[2]).all() and np.isnan(other.columns["margin"][2])
+    assert other.columns["status"].tolist() == ["SOLVED", "SOLVED", "INVALID_INPUT"]
     np.testing.assert_allclose(
         other.stages["squeeze"].joints[:2], found.stages["squeeze"].joints[:2], rtol=0, atol=1e-12
     )

@@ -155,7 +155,7 @@ def _print(squeezed: "GraspSet", written: Sequence[Path]) -> None:
             escape(name),
             f"{rows.sum():,}",
             f"{(margin > 1e-6).mean():.1%}",
-            f"{np.median(margin):.3g} N",
+            f"{np.nanmedian(margin) if np.isfinite(margin).any() else np.nan:.3g} N",
             f"{np.median(strongest[rows]):.3g} N",
             f"{np.nanmedian(travel[rows]) if np.isfinite(travel[rows]).any() else np.nan:.3g} rad",
         )

@@ -33,6 +33,7 @@ from jaxgrasp.hands.hand_object import HandObject
 from jaxgrasp.hands.softness import depths
 from jaxgrasp.robustness import largest_disturbance, least_effort
 from jaxgrasp.solvers import solve_qp
+from jaxgrasp.solvers.status import Status
 
 # Of the margin; the forces are scaled, so it hardly matters.
 _SHARE = 0.5
@@ -104,7 +105,7 @@ class Squeezes:
     torques: Float[np.ndarray, "n joints"]
     """J'f, N m or N."""
     margin: Float[np.ndarray, " n"]
-    """(21), with the contacts that take part."""
+    """(21), with the contacts that take part; NaN where there is no configuration."""
     effort: Float[np.ndarray, " n"]
     """1/2 f'f, N^2."""
     status: Int[np.ndarray, " n"]
@@ -210,6 +211,7 @@ def _squeezes(hand: HandObject, given: Squeezable, closing: np.ndarray | None) -
         joints = np.where(near[:, None], joints, closing)
     lost = ~given.known if closing is not None else ~(near & given.known)
     joints[lost], controls[lost] = np.nan, np.nan
+    margin, status = np.where(given.known, margin, np.nan), np.where(given.known, status, Status.INVALID_INPUT)
     points = np.einsum("nij,nkj->nki", given.object_rotation, given.positions) + given.object_position[:, None]
     return Squeezes(
         joints=joints,
