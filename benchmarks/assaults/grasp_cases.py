@@ -133,6 +133,11 @@ def text(home: Path) -> Iterator[tuple[str, Path]]:
         "ragged results": {"result": [1, [2], 3, 4]},
     }.items():
         yield _written(home, name, ".json", json.dumps(table | change))
+    grasps = {"transforms": np.tile(np.eye(4), (20_000, 1, 1)).tolist()}
+    yield _written(
+        home, "a long name", ".json", json.dumps({"object": {"file": "x" * 10**6, "scale": 1}, "grasps": grasps})
+    )
+    yield _written(home, "long results", ".json", json.dumps(table | {"result": ["x", "y", "z", "x" * 10**6]}))
     yield _written(home, "deep", ".json", '{"pose": ' + "[" * 1_000_000)
     yield _written(home, "cut", ".json", good[: len(good) // 2])
     yield _written(home, "digits", ".json", '{"pose": ' + "9" * 1_000_000 + "}")
@@ -252,6 +257,7 @@ def arrays(home: Path) -> Iterator[tuple[str, Path]]:
         "scales of three": {"obj_scale": np.ones((4, 3))},
         "objects": {"grasp_qpos": np.array([{}, {}, {}, {}])},
         "names that are numbers": {"object_name": np.arange(4)},
+        "long names": {"joint_names": np.array(["a", "b", "x" * 10**6])},
     }.items():
         np.savez(home / f"{name}.npz", **(good | change))
         yield name, home / f"{name}.npz"

@@ -7,6 +7,7 @@ there: twice the grasp less the pre-grasp.
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ def read(content: Content, given: Given) -> GraspSet:
     Raises:
         FileError: A field cannot be used.
     """
-    grasp = content.table.get(_GRASP)
+    grasp: Any = content.table.get(_GRASP)
     if not isinstance(grasp, np.ndarray) or grasp.ndim not in (1, 2):
         raise FileError(content.path, _GRASP, f"{np.shape(grasp)}", "(7 + joints,) or (N, 7 + joints)")
     table = dict(content.table)

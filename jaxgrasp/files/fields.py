@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.files.columns import numbers
+from jaxgrasp.files.columns import numbers, text_array
 from jaxgrasp.files.grasp_set import GRASP, GraspSet, HandPoses
 from jaxgrasp.storage import FileError, printable
 
@@ -74,7 +74,7 @@ def checked_joints(path: Path, field: str, names: Sequence[object]) -> tuple[str
     """
     if not 0 < len(names) <= _JOINTS or not all(isinstance(name, str) for name in names):
         raise FileError(path, field, f"{len(names)} names of joints", f"text, 1 to {_JOINTS} of them")
-    return tuple(printable(name) for name in names)
+    return tuple(text_array(path, field, [printable(name) for name in names]).tolist())
 
 
 def stacked(path: Path, field: str, rows: Sequence[Mapping[str, object]], names: Sequence[str]) -> np.ndarray:

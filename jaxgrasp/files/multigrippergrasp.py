@@ -6,7 +6,7 @@ PhysX, level by level of the gripper's tree: names come from the hand, where one
 
 import numpy as np
 
-from jaxgrasp.files.columns import numbers, sources
+from jaxgrasp.files.columns import numbers, sources, text_array, texts
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.fields import array, single_stage
 from jaxgrasp.files.frames import standing
@@ -43,7 +43,7 @@ def read(content: Content, given: Given) -> GraspSet:
         joint_names=given.names_by_level(path, "dofs", joints.shape[1]),
         object_pose=standing(count),
         object_scale=np.ones(count),
-        object_name=np.full(count, printable(table.get("object_ID", path.stem))),
+        object_name=texts(path, "object_ID", printable(table.get("object_ID", path.stem)), count),
         source=sources(path, count),
         columns=columns,
     )
@@ -51,7 +51,7 @@ def read(content: Content, given: Given) -> GraspSet:
 
 def _column(content: Content, name: object, value: list) -> np.ndarray:
     if all(isinstance(each, str) for each in value):
-        return np.array(value, dtype=str)
+        return text_array(content.path, str(name), value)
     if all(isinstance(each, bool) for each in value):
         return np.array(value)
     # What is not known of a grasp is null.

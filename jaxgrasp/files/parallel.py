@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.files.columns import numbers, sources, travelling
+from jaxgrasp.files.columns import numbers, sources, texts, travelling
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.fields import array, part, single_stage
 from jaxgrasp.files.frames import of_transforms, standing
@@ -87,7 +87,7 @@ def _read(
         joint_names=(),
         object_pose=standing(count),
         object_scale=np.full(count, scale),
-        object_name=np.full(count, printable(name)),
+        object_name=texts(path, "object file", printable(name), count),
         source=sources(path, count),
         columns=travelling(others, count),
     )

@@ -45,9 +45,17 @@ def read_apart(path: Path, kind: str) -> dict[str, np.ndarray]:
         command += [kind, str(path.absolute()), str(result), *limits]
         # No filters of HDF5 from elsewhere, and no threads, each of which would take addresses of its own.
         environment = os.environ | {"HDF5_PLUGIN_PATH": "::", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        quiet = subprocess.DEVNULL
         try:
-            child = subprocess.run(command, cwd=folder, env=environment, timeout=_PATIENCE, **streams)
+            child = subprocess.run(
+                command,
+                cwd=folder,
+                env=environment,
+                timeout=_PATIENCE,
+                stdin=quiet,
+                stdout=subprocess.PIPE,
+                stderr=quiet,
+            )
         except subprocess.TimeoutExpired as error:
             raise FileError(path, None, f"a file that takes more than {_PATIENCE:g} s to read", wanted) from error
         if child.returncode == 0:
