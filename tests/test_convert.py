@@ -94,10 +94,11 @@ def test_isaac_grasp_round_trips_exactly(folder):
     np.testing.assert_allclose(matrices(moved.stages["grasp"].base), wanted, atol=1e-7)
 
 
-def test_what_isaac_grasp_cannot_hold_is_refused(folder):
+def test_what_isaac_grasp_cannot_hold_is_told_or_refused(folder):
     grasps = read_grasps("in.npz")
-    with pytest.raises(ValueError, match="isaac_grasp: got joints without names, wanted the hand"):
-        write_grasps(grasps.unnamed(), "out.yaml", "isaac_grasp")
+    lost = write_grasps(grasps.unnamed(), "out.yaml", "isaac_grasp")
+    assert lost[0] == "which joints these are (--hand has their names)"
+    assert read_grasps("out.yaml").joint_names == ("dof_0", "dof_1", "dof_2")
     with pytest.raises(ValueError, match="in.npz: object_scale: got no scale"):
         write_grasps(replace(grasps, object_scale=np.full(12, np.nan)), "out.yaml", "isaac_grasp")
 
