@@ -16,7 +16,7 @@ from jaxgrasp.files.columns import numbers, per_grasp, sources, text_array
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.fields import array, checked_joints, part, stacked
 from jaxgrasp.files.frames import standing
-from jaxgrasp.files.given import Given
+from jaxgrasp.files.given import WORLD, Given
 from jaxgrasp.files.grasp_set import GRASP, GraspSet, HandPoses
 from jaxgrasp.storage import FileError, printable
 
@@ -105,4 +105,4 @@ def _frame(table: Mapping[str, Any], name: str) -> str | None:
 
 def _link(table: Mapping[str, Any], given: Given) -> str | None:
     link = _frame(table, "gripper_frame")
-    return link if link is not None and given.has_link(link) else "world"
+    return link if link is not None and given.has_link(link) else WORLD

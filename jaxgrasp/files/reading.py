@@ -1,6 +1,7 @@
 """Files of grasps in, one set of grasps out: the format is looked up by the content of each file."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -45,6 +46,7 @@ def read_grasps(
         try:
             content = read_content(path)
             part = (chosen or format_of(content)).read(content, given)
+            parts, part = _named_alike(parts, part, given)
             parts.append(in_order_of(parts[0], part) if parts else part)
         except FileError as error:
             if skipped is None:
@@ -54,4 +56,17 @@ def read_grasps(
             progress(number + 1, len(files))
     if not parts:
         raise FileError(", ".join(map(str, words)) or "grasps", None, "no grasps at all", "files of grasps")
-    return concatenate(parts)
+    found = concatenate(parts)
+    return replace(found, notes=(*found.notes, *sorted(given.assumed)))
+
+
+def _named_alike(parts: list[GraspSet], part: GraspSet, given: Given) -> tuple[list[GraspSet], GraspSet]:
+    """Names joints by the hand, where there is one, in files without names that lie beside files with names."""
+    names = None
+    if parts and (parts[0].joint_names is None) != (part.joint_names is None):
+        names = given.names_in_order()
+    if names is None:
+        return parts, part
+    if part.joint_names is None:
+        return parts, part.for_hand(names)
+    return [other.for_hand(names) for other in parts], part.for_hand(names)
