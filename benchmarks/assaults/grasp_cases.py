@@ -197,6 +197,10 @@ def tables(home: Path) -> Iterator[tuple[str, Path]]:
     def inflated(file: h5py.File) -> None:
         file.create_dataset("grasps/transforms", (30_000_000, 4, 4), "f8", chunks=(1000, 4, 4), compression="gzip")
 
+    def zeros(file: h5py.File) -> None:
+        data = file.create_dataset("grasps/transforms", (5_000_000, 4, 4), "f8", chunks=(10_000, 4, 4), compression=9)
+        data[:20_000] = 0.0
+
     def outside(file: h5py.File) -> None:
         file.create_dataset("grasps/transforms", (4, 4, 4), "f8", external=[("/etc/passwd", 0, 512)])
 
@@ -213,6 +217,7 @@ def tables(home: Path) -> Iterator[tuple[str, Path]]:
 
     yield hdf5("large", large)
     yield hdf5("inflated", inflated)
+    yield hdf5("zeros", zeros)
     yield hdf5("data of another file", outside)
     yield hdf5("virtual", virtual)
     yield hdf5("link to a file", link(h5py.ExternalLink("/etc/passwd", "/x")))
@@ -234,6 +239,10 @@ def tables(home: Path) -> Iterator[tuple[str, Path]]:
     parquet.write_table(pa.table({"grasp_qpos": pa.array([[0.0] * 9, [0.0] * 10])}), stream)
     yield _written(home, "ragged", ".parquet", stream.getvalue())
     yield _written(home, "cut", ".parquet", stream.getvalue()[:-20])
+    repeated = pa.ListArray.from_arrays(pa.array([0, 30_000_000], pa.int32()), pa.array(np.zeros(30_000_000)))
+    stream = io.BytesIO()
+    parquet.write_table(pa.table({"grasp_qpos": repeated}), stream)
+    yield _written(home, "repeated", ".parquet", stream.getvalue())
     yield _written(home, "no footer", ".parquet", b"PAR1" + b"\0" * 1000)
     yield _written(home, "a footer beyond the file", ".parquet", b"PAR1" + b"\0" * 100 + b"\xff\xff\xff\x7fPAR1")
     yield _written(home, "words", ".csv", "grasp_qpos_0,grasp_qpos_1\nx,y\n")

@@ -77,8 +77,11 @@ def _parquet(path: str, budget: int) -> dict[str, np.ndarray]:
 
     with parquet.ParquetFile(path, memory_map=False) as file:
         about = file.metadata
-        size = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
-        if max(size, 8 * about.num_rows * about.num_columns) > budget or about.num_columns > _COLUMNS:
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        size = sum(group.total_byte_size for group in groups)
+        # Lists have more values than rows, and numbers that repeat take hardly any bytes.
+        count = sum(group.column(j).num_values for group in groups for j in range(about.num_columns))
+        if max(size, 8 * count) > budget or about.num_columns > _COLUMNS:
             raise _Refused("data that are too large or too many (see --read-limit)")
         table = file.read(use_threads=False)
     return _joined(table, budget)
