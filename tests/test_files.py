@@ -87,6 +87,7 @@ def test_a_bad_file_is_named_or_passed_over(tmp_path):
     np.savez(tmp_path / "c.npz", **table(2) | {"joint_names": np.array(["a", "b"])})
     np.savez(tmp_path / "d.npz", **table(2) | {"joint_names": np.array(["a", "b", "b"])})
     np.savez(tmp_path / "e.npz", **table(2) | {"obj_pose": np.zeros((2, 6))})
+    np.savez(tmp_path / "f.npz", **table(2) | {"obj_scale": np.array([1.0, 0.0])})
     said: list[str] = []
     assert len(read_grasps(tmp_path, skipped=lambda error: said.append(str(error)))) == 2
     assert [text.split("/")[-1].split(": got")[0] for text in said] == [
@@ -94,6 +95,7 @@ def test_a_bad_file_is_named_or_passed_over(tmp_path):
         "c.npz: grasp_qpos",
         "d.npz: joint_names",
         "e.npz: obj_pose",
+        "f.npz: object_scale",
     ]
     with pytest.raises(FileError, match="b.npz: got a truncated .npz file"):
         read_grasps(tmp_path)

@@ -5,6 +5,8 @@ from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
+
 from jaxgrasp.files.content import read_content
 from jaxgrasp.files.formats import format_of, named
 from jaxgrasp.files.given import Given
@@ -46,6 +48,7 @@ def read_grasps(
         try:
             content = read_content(path)
             part = (chosen or format_of(content)).read(content, given)
+            _check_scales(path, part)
             parts, part = _named_alike(parts, part, given)
             parts.append(in_order_of(parts[0], part) if parts else part)
         except FileError as error:
@@ -58,6 +61,13 @@ def read_grasps(
         raise FileError(", ".join(map(str, words)) or "grasps", None, "no grasps at all", "files of grasps")
     found = concatenate(parts)
     return replace(found, notes=(*found.notes, *sorted(given.assumed)))
+
+
+def _check_scales(path: Path, part: GraspSet) -> None:
+    """Refuses scales with which there is no object; those that a file does not say are no numbers."""
+    wrong = np.flatnonzero((part.object_scale <= 0) | np.isinf(part.object_scale))
+    if len(wrong):
+        raise FileError(path, "object_scale", f"{part.object_scale[wrong[0]]:g} in row {wrong[0]}", "a number above 0")
 
 
 def _named_alike(parts: list[GraspSet], part: GraspSet, given: Given) -> tuple[list[GraspSet], GraspSet]:
