@@ -51,6 +51,12 @@ def pickles(home: Path) -> Iterator[tuple[str, Path]]:
         yield _written(home, name, ".npy", npy(content))
         if content.startswith(b"\x80"):
             yield _written(home, f"{name} bare", ".pkl", content)
+    header, path = npy(b""), home / "sparse.npy"
+    path.write_bytes(header)
+    os.truncate(path, 100 << 20)
+    yield "sparse", path
+    large = b"\x8e" + (90 << 20).to_bytes(8, "little") + bytes(90 << 20)
+    yield _written(home, "bytes", ".npy", npy(b"}X\x0a\0\0\0grasp_qpos" + large + b"s."))
     for name in ("os.system", "eval"):
         yield _written(home, f"{name} bare", ".pkl", pickle.dumps(CALLS[name], 2))
         # What ends before the pickle does, and a list of a good grasp and a call.
@@ -138,6 +144,7 @@ def text(home: Path) -> Iterator[tuple[str, Path]]:
         home, "a long name", ".json", json.dumps({"object": {"file": "x" * 10**6, "scale": 1}, "grasps": grasps})
     )
     yield _written(home, "long results", ".json", json.dumps(table | {"result": ["x", "y", "z", "x" * 10**6]}))
+    yield _written(home, "long text", ".json", b'{"pose": "' + bytes([97]) * (31 << 20) + "\U0001f600".encode() + b'"}')
     yield _written(home, "deep", ".json", '{"pose": ' + "[" * 1_000_000)
     yield _written(home, "cut", ".json", good[: len(good) // 2])
     yield _written(home, "digits", ".json", '{"pose": ' + "9" * 1_000_000 + "}")

@@ -37,7 +37,8 @@ def read(content: Content, given: Given) -> GraspSet:
     """
     grasp: Any = content.table.get(_GRASP)
     if not isinstance(grasp, np.ndarray) or grasp.ndim not in (1, 2):
-        raise FileError(content.path, _GRASP, f"{np.shape(grasp)}", "(7 + joints,) or (N, 7 + joints)")
+        got = f"shape {grasp.shape}" if isinstance(grasp, np.ndarray) else type(grasp).__name__
+        raise FileError(content.path, _GRASP, got, "an array (7 + joints,) or (N, 7 + joints)")
     table = dict(content.table)
     name = table.pop("obj_path", "")
     if grasp.ndim == 1:
