@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -151,6 +152,19 @@ def test_isaac_grasps_without_joints_or_with_those_before_it_alone(tmp_path):
     path.write_text(text.replace("cspace_position:", "cspace:").replace("format_version: 1.0\n", ""))
     grasps = read_grasps(path)
     assert grasps.joint_names == () and grasps.stages["grasp"].joints.shape == (COUNT, 0)
+
+
+def test_fewer_fields_of_json(tmp_path, hand):
+    t = truth()
+    for name in ("multigrippergrasp", "graspgen"):
+        path = SAMPLES[name](tmp_path, t, of_palm)
+        wanted = read_grasps(path, hand=hand)
+        table = json.loads(path.read_text())
+        changed = {"final_dofs": table.pop("dofs"), "object_id": table.pop("object_ID")} if "dofs" in table else {}
+        table.pop("object", None)
+        path.write_text(json.dumps(table | changed))
+        found = read_grasps(path, hand=hand)
+        assert repr(found.stages) == repr(wanted.stages) and set(found.object_name) == {"mug"}
 
 
 def test_files_with_and_without_names_go_together_by_the_hand(tmp_path, hand):

@@ -56,9 +56,11 @@ def read_graspgen(content: Content, given: Given) -> GraspSet:
         FileError: A field cannot be used.
     """
     path, grasps = content.path, part(content.path, content.table, "grasps")
-    thing = part(path, content.table, "object")
-    scale = uniform(path, "object.scale", part(path, thing, "scale", (int, float, list), "object."))
-    name = part(path, thing, "file", str, "object.")
+    scale, name = np.nan, path.stem
+    if "object" in content.table:
+        thing = part(path, content.table, "object")
+        scale = uniform(path, "object.scale", part(path, thing, "scale", (int, float, list), "object."))
+        name = part(path, thing, "file", str, "object.")
     others = {
         str(field): np.array(value)
         for field, value in grasps.items()
