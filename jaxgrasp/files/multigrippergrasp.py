@@ -45,9 +45,7 @@ def read(content: Content, given: Given) -> GraspSet:
         joint_names=given.names_by_level(path, field, joints.shape[1]),
         object_pose=standing(count),
         object_scale=np.ones(count),
-        object_name=texts(
-            path, "object_ID", printable(table.get("object_ID", table.get("object_id", path.stem))), count
-        ),
+        object_name=texts(path, "object_ID", printable(name), count),
         source=sources(path, count),
         columns=columns,
     )
