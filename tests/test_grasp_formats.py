@@ -154,6 +154,19 @@ def test_isaac_grasps_without_joints_or_with_those_before_it_alone(tmp_path):
     assert grasps.joint_names == () and grasps.stages["grasp"].joints.shape == (COUNT, 0)
 
 
+def test_grasps_of_dexgraspbench_whose_object_stands_in_a_scene(tmp_path):
+    one = np.load(SAMPLES["dexgraspbench"](tmp_path, truth(), of_palm) / "0.npy", allow_pickle=True).item()
+    del one["obj_pose"], one["obj_scale"], one["obj_path"]
+    with pytest.raises(FileError, match="bare.npy: obj_pose: got neither it nor a scene_path"):
+        read_grasps(save(tmp_path / "bare.npy", one))
+    grasps = read_grasps(save(tmp_path / "named.npy", one | {"scene_path": "mug/scale012_pose003.npy"}))
+    assert grasps.object_scale.tolist() == [0.12] and "beside it" in grasps.notes[0]
+    (tmp_path / "mug").mkdir()
+    save(tmp_path / "mug" / "scale012_pose003.npy", scene("mug"))
+    grasps = read_grasps(tmp_path / "named.npy")
+    assert grasps.object_scale.tolist() == [SCALE] and grasps.object_name.tolist() == ["mug"] and grasps.notes == ()
+
+
 def test_fewer_fields_of_json(tmp_path, hand):
     t = truth()
     for name in ("multigrippergrasp", "graspgen"):

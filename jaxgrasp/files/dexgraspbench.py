@@ -6,6 +6,7 @@ there: twice the grasp less the pre-grasp.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from jaxgrasp.files.content import Content
 from jaxgrasp.files.given import Given
 from jaxgrasp.files.grasp_set import GRASP, GraspSet
 from jaxgrasp.files.pickling import write_pickled
+from jaxgrasp.files.scene_cfg import placed
 from jaxgrasp.storage import FileError
 
 NAME = "dexgraspbench"
@@ -43,9 +45,18 @@ def read(content: Content, given: Given) -> GraspSet:
     name = table.pop("obj_path", "")
     if grasp.ndim == 1:
         table = {field: one_row(value) for field, value in table.items()}
+    note = ""
+    if "obj_pose" not in table:
+        # Newer files name a scene in its place.
+        scene = content.table.get("scene_path")
+        if not isinstance(scene, str):
+            raise FileError(content.path, "obj_pose", "neither it nor a scene_path", "where the object stands")
+        thing = placed(content.path, scene)
+        note, name = thing.note, name or thing.name
+        table = {"obj_scale": thing.scale} | table | {"obj_pose": thing.pose}
     table["object_name"] = name if isinstance(name, str) else np.asarray(name)
     table.setdefault("obj_scale", np.nan)
-    return grasps_of_columns(content.path, table)
+    return replace(grasps_of_columns(content.path, table), notes=(note,) if note else ())
 
 
 def one_row(value: object) -> object:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxgrasp.files.columns import numbers, text_array
-from jaxgrasp.files.grasp_set import GRASP, GraspSet, HandPoses
+from jaxgrasp.files.grasp_set import GRASP, HandPoses
 from jaxgrasp.storage import FileError, printable
 
 
@@ -92,17 +92,6 @@ def stacked(path: Path, field: str, rows: Sequence[Mapping[str, object]], names:
             )
     table = numbers(path, field, [[row[name] for name in names] for row in rows])
     return table.reshape(len(rows), len(names))
-
-
-def refuse_empty(path: Path, field: str, grasps: GraspSet) -> GraspSet:
-    """The grasps, of which there must be one at least.
-
-    Raises:
-        FileError: There is none.
-    """
-    if not len(grasps):
-        raise FileError(path, field, "no grasps", "at least one")
-    return grasps
 
 
 _JOINTS = 1_000
