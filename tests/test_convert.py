@@ -199,3 +199,18 @@ def test_published_grasps_round_trip_exactly(object_name, tmp_path):
     exactly(isaac, grasps, ("grasp",))
     np.testing.assert_array_equal(isaac.stages["pregrasp"].joints, grasps.stages["pregrasp"].joints)
     assert len(isaac.joint_names) == 22 and "where the base stands before the grasp" in lost
+
+
+def test_ctrl_c_keeps_the_grasps_that_are_written(folder, capsys, monkeypatch):
+    calls = []
+
+    def checkpoint() -> None:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxgrasp.cli.signals.checkpoint", checkpoint)
+    assert main(["convert", "in.npz", "--to", "dexgraspbench", "--output", "out"]) == 130
+    assert capsys.readouterr().err == "jaxgrasp: interrupted: wrote 3 of 12 grasps to out\n"
+    assert sorted(path.name for path in Path("out").iterdir()) == ["00.npy", "01.npy", "02.npy"]
+    assert len(read_grasps("out")) == 3
