@@ -94,10 +94,11 @@ def test_isaac_grasp_round_trips_exactly(folder):
     np.testing.assert_allclose(matrices(moved.stages["grasp"].base), wanted, atol=1e-7)
 
 
-def test_what_isaac_grasp_cannot_hold_is_refused(folder):
+def test_what_isaac_grasp_cannot_hold_is_told_or_refused(folder):
     grasps = read_grasps("in.npz")
-    with pytest.raises(ValueError, match="isaac_grasp: got joints without names, wanted the hand"):
-        write_grasps(grasps.unnamed(), "out.yaml", "isaac_grasp")
+    lost = write_grasps(grasps.unnamed(), "out.yaml", "isaac_grasp")
+    assert lost[0] == "which joints these are (--hand has their names)"
+    assert read_grasps("out.yaml").joint_names == ("dof_0", "dof_1", "dof_2")
     with pytest.raises(ValueError, match="in.npz: object_scale: got no scale"):
         write_grasps(replace(grasps, object_scale=np.full(12, np.nan)), "out.yaml", "isaac_grasp")
 
@@ -198,3 +199,18 @@ def test_published_grasps_round_trip_exactly(object_name, tmp_path):
     exactly(isaac, grasps, ("grasp",))
     np.testing.assert_array_equal(isaac.stages["pregrasp"].joints, grasps.stages["pregrasp"].joints)
     assert len(isaac.joint_names) == 22 and "where the base stands before the grasp" in lost
+
+
+def test_ctrl_c_keeps_the_grasps_that_are_written(folder, capsys, monkeypatch):
+    calls = []
+
+    def checkpoint() -> None:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxgrasp.cli.signals.checkpoint", checkpoint)
+    assert main(["convert", "in.npz", "--to", "dexgraspbench", "--output", "out"]) == 130
+    assert capsys.readouterr().err == "jaxgrasp: interrupted: wrote 3 of 12 grasps to out\n"
+    assert sorted(path.name for path in Path("out").iterdir()) == ["00.npy", "01.npy", "02.npy"]
+    assert len(read_grasps("out")) == 3

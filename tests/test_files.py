@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow import csv, parquet
 
 from jaxgrasp.files import GraspSet, concatenate, read_grasps, write_grasps
 from jaxgrasp.storage import FileError
@@ -87,6 +89,7 @@ def test_a_bad_file_is_named_or_passed_over(tmp_path):
     np.savez(tmp_path / "c.npz", **table(2) | {"joint_names": np.array(["a", "b"])})
     np.savez(tmp_path / "d.npz", **table(2) | {"joint_names": np.array(["a", "b", "b"])})
     np.savez(tmp_path / "e.npz", **table(2) | {"obj_pose": np.zeros((2, 6))})
+    np.savez(tmp_path / "f.npz", **table(2) | {"obj_scale": np.array([1.0, 0.0])})
     said: list[str] = []
     assert len(read_grasps(tmp_path, skipped=lambda error: said.append(str(error)))) == 2
     assert [text.split("/")[-1].split(": got")[0] for text in said] == [
@@ -94,6 +97,7 @@ def test_a_bad_file_is_named_or_passed_over(tmp_path):
         "c.npz: grasp_qpos",
         "d.npz: joint_names",
         "e.npz: obj_pose",
+        "f.npz: object_scale",
     ]
     with pytest.raises(FileError, match="b.npz: got a truncated .npz file"):
         read_grasps(tmp_path)
@@ -101,3 +105,36 @@ def test_a_bad_file_is_named_or_passed_over(tmp_path):
         read_grasps(tmp_path, "nix")
     with pytest.raises(ValueError, match="format: got 'nix', wanted one of .*jaxgrasp"):
         write_grasps(read_grasps(tmp_path / "a.npz"), tmp_path / "x", "nix")
+
+
+def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    found = {}
+    for name, column in columns.items():
+        found |= {f"{name}_{k}": column[:, k] for k in range(column.shape[1])} if column.ndim > 1 else {name: column}
+    return found
+
+
+@pytest.mark.parametrize("kind", ["parquet", "flat.parquet", "csv", "h5"])
+def test_tables_say_the_same_as_archives(kind, tmp_path):
+    columns = {name: x for name, x in table().items() if name != "other"}
+    np.savez(tmp_path / "in.npz", **columns)
+    path = tmp_path / f"in.{kind}"
+    names = columns.pop("joint_names")
+    if kind == "h5":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            for name, column in (columns | {"joint_names": names}).items():
+                file[name] = column.astype(object) if column.dtype.kind == "U" else column
+    elif kind == "parquet":
+        lists = {name: column.tolist() for name, column in columns.items()}
+        parquet.write_table(pa.table(lists | {"joint_names": [names.tolist()] * 4}), path)
+    else:
+        rows = pa.table(flat(columns) | {"joint_names": np.array([";".join(names)] * 4)})
+        csv.write_csv(rows, path) if kind == "csv" else parquet.write_table(rows, path)
+    ours, theirs = read_grasps(tmp_path / "in.npz"), read_grasps(path)
+    assert theirs.joint_names == ours.joint_names and theirs.columns.keys() == ours.columns.keys()
+    for name in ours.stages:
+        np.testing.assert_allclose(theirs.stages[name].qpos, ours.stages[name].qpos, rtol=1e-6)
+    np.testing.assert_array_equal(theirs.object_name, ours.object_name)
+    np.testing.assert_array_equal(theirs.columns["succ_flag"], ours.columns["succ_flag"])
+    np.testing.assert_allclose(theirs.object_scale, ours.object_scale)

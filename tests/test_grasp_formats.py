@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -73,6 +74,7 @@ def test_every_format_becomes_the_same_grasps(name, given, tmp_path, hand):
             np.testing.assert_allclose(joints[:, order], wanted, atol=CLOSE)
 
 
+TOGETHER = ("dexgraspbench", "dexgraspnet", "graspqp", "dexonomy")
 WHAT_TRAVELS = {
     "dexgraspbench": {"succ_flag", "ho_pene"},
     "bodex": {"grasp_error"},
@@ -146,9 +148,50 @@ def test_isaac_grasps_without_joints_or_with_those_before_it_alone(tmp_path):
     grasps = read_grasps(path)
     np.testing.assert_array_equal(grasps.stages["grasp"].joints, t.pregrasp[:, [1, 2, 0]])
     assert "fingers are taken to stand as in pregrasp_cspace_position" in grasps.notes[0]
+    assert grasps.notes[1] == "palm is taken to stand in the world of the hand's file, which --hand would look up"
     path.write_text(text.replace("cspace_position:", "cspace:").replace("format_version: 1.0\n", ""))
     grasps = read_grasps(path)
-    assert grasps.joint_names == () and grasps.stages["grasp"].joints.shape == (COUNT, 0) and grasps.notes == ()
+    assert grasps.joint_names == () and grasps.stages["grasp"].joints.shape == (COUNT, 0)
+
+
+def test_grasps_of_dexgraspbench_whose_object_stands_in_a_scene(tmp_path):
+    one = np.load(SAMPLES["dexgraspbench"](tmp_path, truth(), of_palm) / "0.npy", allow_pickle=True).item()
+    del one["obj_pose"], one["obj_scale"], one["obj_path"]
+    with pytest.raises(FileError, match="bare.npy: obj_pose: got neither it nor a scene_path"):
+        read_grasps(save(tmp_path / "bare.npy", one))
+    grasps = read_grasps(save(tmp_path / "named.npy", one | {"scene_path": "mug/scale012_pose003.npy"}))
+    assert grasps.object_scale.tolist() == [0.12] and "beside it" in grasps.notes[0]
+    (tmp_path / "mug").mkdir()
+    save(tmp_path / "mug" / "scale012_pose003.npy", scene("mug"))
+    grasps = read_grasps(tmp_path / "named.npy")
+    assert grasps.object_scale.tolist() == [SCALE] and grasps.object_name.tolist() == ["mug"] and grasps.notes == ()
+
+
+def test_fewer_fields_of_json(tmp_path, hand):
+    t = truth()
+    for name in ("multigrippergrasp", "graspgen"):
+        path = SAMPLES[name](tmp_path, t, of_palm)
+        wanted = read_grasps(path, hand=hand)
+        table = json.loads(path.read_text())
+        changed = {"final_dofs": table.pop("dofs"), "object_id": table.pop("object_ID")} if "dofs" in table else {}
+        table.pop("object", None)
+        path.write_text(json.dumps(table | changed))
+        found = read_grasps(path, hand=hand)
+        assert repr(found.stages) == repr(wanted.stages) and set(found.object_name) == {"mug"}
+
+
+def test_files_with_and_without_names_go_together_by_the_hand(tmp_path, hand):
+    t = truth()
+    paths = [SAMPLES[name](tmp_path, t, of_palm if name in OF_LINK else lambda base: base) for name in TOGETHER]
+    for order in (paths, paths[::-1]):
+        grasps = read_grasps(order, hand=hand)
+        assert len(grasps) == COUNT * len(TOGETHER) and set(grasps.joint_names) == set(JOINTS)
+        columns = [grasps.joint_names.index(name) for name in JOINTS]
+        np.testing.assert_allclose(
+            grasps.stages["grasp"].joints[:, columns], np.tile(t.grasp, (len(TOGETHER), 1)), atol=CLOSE
+        )
+    with pytest.raises(FileError, match="joint_names: got (no )?names"):
+        read_grasps(paths)
 
 
 def test_scenes_are_looked_for_beside_the_grasps_alone(tmp_path, monkeypatch):

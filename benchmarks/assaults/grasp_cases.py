@@ -51,6 +51,12 @@ def pickles(home: Path) -> Iterator[tuple[str, Path]]:
         yield _written(home, name, ".npy", npy(content))
         if content.startswith(b"\x80"):
             yield _written(home, f"{name} bare", ".pkl", content)
+    header, path = npy(b""), home / "sparse.npy"
+    path.write_bytes(header)
+    os.truncate(path, 100 << 20)
+    yield "sparse", path
+    large = b"\x8e" + (90 << 20).to_bytes(8, "little") + bytes(90 << 20)
+    yield _written(home, "bytes", ".npy", npy(b"}X\x0a\0\0\0grasp_qpos" + large + b"s."))
     for name in ("os.system", "eval"):
         yield _written(home, f"{name} bare", ".pkl", pickle.dumps(CALLS[name], 2))
         # What ends before the pickle does, and a list of a good grasp and a call.
@@ -133,6 +139,12 @@ def text(home: Path) -> Iterator[tuple[str, Path]]:
         "ragged results": {"result": [1, [2], 3, 4]},
     }.items():
         yield _written(home, name, ".json", json.dumps(table | change))
+    grasps = {"transforms": np.tile(np.eye(4), (20_000, 1, 1)).tolist()}
+    yield _written(
+        home, "a long name", ".json", json.dumps({"object": {"file": "x" * 10**6, "scale": 1}, "grasps": grasps})
+    )
+    yield _written(home, "long results", ".json", json.dumps(table | {"result": ["x", "y", "z", "x" * 10**6]}))
+    yield _written(home, "long text", ".json", b'{"pose": "' + bytes([97]) * (31 << 20) + "\U0001f600".encode() + b'"}')
     yield _written(home, "deep", ".json", '{"pose": ' + "[" * 1_000_000)
     yield _written(home, "cut", ".json", good[: len(good) // 2])
     yield _written(home, "digits", ".json", '{"pose": ' + "9" * 1_000_000 + "}")
@@ -192,6 +204,10 @@ def tables(home: Path) -> Iterator[tuple[str, Path]]:
     def inflated(file: h5py.File) -> None:
         file.create_dataset("grasps/transforms", (30_000_000, 4, 4), "f8", chunks=(1000, 4, 4), compression="gzip")
 
+    def zeros(file: h5py.File) -> None:
+        data = file.create_dataset("grasps/transforms", (5_000_000, 4, 4), "f8", chunks=(10_000, 4, 4), compression=9)
+        data[:20_000] = 0.0
+
     def outside(file: h5py.File) -> None:
         file.create_dataset("grasps/transforms", (4, 4, 4), "f8", external=[("/etc/passwd", 0, 512)])
 
@@ -208,6 +224,7 @@ def tables(home: Path) -> Iterator[tuple[str, Path]]:
 
     yield hdf5("large", large)
     yield hdf5("inflated", inflated)
+    yield hdf5("zeros", zeros)
     yield hdf5("data of another file", outside)
     yield hdf5("virtual", virtual)
     yield hdf5("link to a file", link(h5py.ExternalLink("/etc/passwd", "/x")))
@@ -229,6 +246,10 @@ def tables(home: Path) -> Iterator[tuple[str, Path]]:
     parquet.write_table(pa.table({"grasp_qpos": pa.array([[0.0] * 9, [0.0] * 10])}), stream)
     yield _written(home, "ragged", ".parquet", stream.getvalue())
     yield _written(home, "cut", ".parquet", stream.getvalue()[:-20])
+    repeated = pa.ListArray.from_arrays(pa.array([0, 30_000_000], pa.int32()), pa.array(np.zeros(30_000_000)))
+    stream = io.BytesIO()
+    parquet.write_table(pa.table({"grasp_qpos": repeated}), stream)
+    yield _written(home, "repeated", ".parquet", stream.getvalue())
     yield _written(home, "no footer", ".parquet", b"PAR1" + b"\0" * 1000)
     yield _written(home, "a footer beyond the file", ".parquet", b"PAR1" + b"\0" * 100 + b"\xff\xff\xff\x7fPAR1")
     yield _written(home, "words", ".csv", "grasp_qpos_0,grasp_qpos_1\nx,y\n")
@@ -252,6 +273,7 @@ def arrays(home: Path) -> Iterator[tuple[str, Path]]:
         "scales of three": {"obj_scale": np.ones((4, 3))},
         "objects": {"grasp_qpos": np.array([{}, {}, {}, {}])},
         "names that are numbers": {"object_name": np.arange(4)},
+        "long names": {"joint_names": np.array(["a", "b", "x" * 10**6])},
     }.items():
         np.savez(home / f"{name}.npz", **(good | change))
         yield name, home / f"{name}.npz"

@@ -85,7 +85,8 @@ class Convert(Reading):
                     nonlocal done
                     done = count
                     progress(count)
-                    signals.note_written(self.output) if count == len(grasps) else signals.checkpoint()
+                    if count < len(grasps):
+                        signals.checkpoint()
 
                 lost = write_grasps(grasps, self.output, self.to, hand=self.hand, progress=show)
         except KeyboardInterrupt:
@@ -96,6 +97,7 @@ class Convert(Reading):
             raise CommandError(f"--{text}" if text.startswith("hand: ") else text) from error
         except OSError as error:
             raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
+        signals.note_written(self.output)
         if lost:
             one_line(f"{self.to} cannot say: {'; '.join(lost)}")
         with printing():

@@ -7,7 +7,7 @@ that come with BODex. Object and scale are in a scene that `scene_path` names, o
 
 import numpy as np
 
-from jaxgrasp.files.columns import joint_names, numbers, per_grasp, sources, travelling
+from jaxgrasp.files.columns import joint_names, numbers, per_grasp, sources, text_array, travelling
 from jaxgrasp.files.columns import poses as poses_of
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.frames import compose, invert, unit
@@ -94,7 +94,7 @@ def _scenes(content: Content, count: int) -> list[str]:
     names = names * count if len(names) == 1 else names
     if len(names) != count or not all(isinstance(name, str) for name in names):
         raise FileError(content.path, "scene_path", f"{len(names)} of {count} scenes", "the path of each")
-    return [str(name) for name in names]
+    return text_array(content.path, "scene_path", list(map(str, names))).tolist()
 
 
 def _by_seed(value: object, scenes: int, seeds: int) -> object:

@@ -4,8 +4,10 @@
 and `obj_scale` (N,) are the object's, `joint_names` (n,) the order of the joints; all else travels along.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +16,12 @@ from jaxgrasp.storage import FileError, printable
 
 STAGE = "_qpos"
 _POSE = 7
+# Names of joints and objects, and paths to them.
+_LONGEST = 1_024
 _OWN = ("obj_pose", "obj_scale", "object_name", "joint_names", "source")
 
 
-def grasps_of_columns(path: Path, table: Mapping[str, object], object_name: str = "") -> GraspSet:
+def grasps_of_columns(path: Path, table: Mapping[str, Any], object_name: str = "") -> GraspSet:
     """Makes grasps of columns.
 
     Args:
@@ -66,7 +70,7 @@ def columns_of_grasps(grasps: GraspSet) -> dict[str, np.ndarray]:
     return table
 
 
-def joint_names(path: Path, value: object) -> tuple[str, ...] | None:
+def joint_names(path: Path, value: Any) -> tuple[str, ...] | None:
     """Names of joints, each once; None where a file has none.
 
     Raises:
@@ -74,14 +78,12 @@ def joint_names(path: Path, value: object) -> tuple[str, ...] | None:
     """
     if value is None:
         return None
-    array = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else np.empty(())
-    if array.dtype.kind == "S":
-        array = np.char.decode(array, "utf-8", "replace")
-    if array.ndim != 1 or array.dtype.kind != "U":
-        raise FileError(path, "joint_names", f"{array.dtype} {array.shape}", "one name for each joint")
+    array = text_array(path, "joint_names", value if len(np.shape(value)) else None)
+    if array.ndim != 1:
+        raise FileError(path, "joint_names", f"shape {array.shape}", "one name for each joint")
     names = tuple(array.tolist())
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise FileError(path, "joint_names", f"{name!r} twice", "each joint once")
     return names
 
@@ -138,12 +140,32 @@ def texts(path: Path, field: str, value: object, count: int) -> np.ndarray:
     Raises:
         FileError: There are not as many, or they are no text.
     """
-    array = np.asarray(value) if isinstance(value, str | np.ndarray | list | tuple) else np.empty(0)
+    array = text_array(path, field, value)
+    if array.shape not in ((), (1,), (count,)):
+        raise FileError(path, field, f"shape {array.shape}", f"text ({count},)")
+    return np.array(np.broadcast_to(array, (count,)))
+
+
+def text_array(path: Path, field: str, value: Any) -> np.ndarray:
+    """An array of text; every entry of it takes as much memory as the longest one.
+
+    Raises:
+        FileError: It is no text, or has long ones in it.
+    """
+    if isinstance(value, list | tuple) and all(isinstance(text, str) for text in value):
+        _check_length(path, field, max(map(len, value), default=0))
+    array: Any = np.asarray(value) if isinstance(value, str | np.ndarray | list | tuple) else np.empty(())
     if array.dtype.kind == "S":
         array = np.char.decode(array, "utf-8", "replace")
-    if array.dtype.kind != "U" or array.shape not in ((), (1,), (count,)):
-        raise FileError(path, field, f"{array.dtype} {array.shape}", f"text ({count},)")
-    return np.array(np.broadcast_to(array, (count,)))
+    if array.dtype.kind != "U":
+        raise FileError(path, field, f"{array.dtype} {array.shape}", "text")
+    _check_length(path, field, array.dtype.itemsize // 4)
+    return array
+
+
+def _check_length(path: Path, field: str, length: int) -> None:
+    if length > _LONGEST:
+        raise FileError(path, field, f"text of {length:,} characters", f"at most {_LONGEST:,}")
 
 
 def sources(path: Path, count: int) -> np.ndarray:
@@ -153,14 +175,14 @@ def sources(path: Path, count: int) -> np.ndarray:
 
 
 def travelling(table: Mapping[str, object], count: int) -> dict[str, np.ndarray]:
-    """Numbers, truth values and text that have something to say of each of N grasps."""
+    """Numbers, truth values and text that have something to say of each of N grasps; long text stays behind."""
     found = {}
     for name, value in table.items():
         if not isinstance(value, np.ndarray) or not value.ndim or len(value) != count:
             continue
         if value.dtype.kind == "S":
             value = np.char.decode(value, "utf-8", "replace")
-        if value.dtype.kind in "biufU":
+        if value.dtype.kind in "biuf" or (value.dtype.kind == "U" and value.dtype.itemsize <= 4 * _LONGEST):
             found[name] = value.astype(value.dtype.newbyteorder("="), copy=False)
     return found
 

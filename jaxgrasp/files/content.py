@@ -9,7 +9,7 @@ from jaxgrasp.files.pickles import unpickle
 from jaxgrasp.files.tables_apart import read_apart
 from jaxgrasp.files.text_trees import read_json, read_xml, read_yaml
 from jaxgrasp.files.torch_files import read_torch
-from jaxgrasp.storage import FileError, open_regular, read_archive, read_array, read_objects
+from jaxgrasp.storage import PICKLE_COST, FileError, open_regular, read_archive, read_array, read_objects
 
 _HEAD = 4096
 WANTED = "a file of grasps in a format that is known"
@@ -72,7 +72,7 @@ def _npy(path: Path) -> Content:
 def _pickle(path: Path, head: bytes) -> Content:
     if _OLD_TORCH in head[:32]:
         raise FileError(path, None, "a torch file of before PyTorch 1.6", "one that torch.save of today has written")
-    with open_regular(path, WANTED, cost=2) as stream:
+    with open_regular(path, WANTED, cost=PICKLE_COST) as stream:
         return Content(path, "objects", unpickle(path, stream.read()))
 
 

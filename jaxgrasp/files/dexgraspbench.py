@@ -6,7 +6,9 @@ there: twice the grasp less the pre-grasp.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from jaxgrasp.files.content import Content
 from jaxgrasp.files.given import Given
 from jaxgrasp.files.grasp_set import GRASP, GraspSet
 from jaxgrasp.files.pickling import write_pickled
+from jaxgrasp.files.scene_cfg import placed
 from jaxgrasp.storage import FileError
 
 NAME = "dexgraspbench"
@@ -34,16 +37,26 @@ def read(content: Content, given: Given) -> GraspSet:
     Raises:
         FileError: A field cannot be used.
     """
-    grasp = content.table.get(_GRASP)
+    grasp: Any = content.table.get(_GRASP)
     if not isinstance(grasp, np.ndarray) or grasp.ndim not in (1, 2):
-        raise FileError(content.path, _GRASP, f"{np.shape(grasp)}", "(7 + joints,) or (N, 7 + joints)")
+        got = f"shape {grasp.shape}" if isinstance(grasp, np.ndarray) else type(grasp).__name__
+        raise FileError(content.path, _GRASP, got, "an array (7 + joints,) or (N, 7 + joints)")
     table = dict(content.table)
     name = table.pop("obj_path", "")
     if grasp.ndim == 1:
         table = {field: one_row(value) for field, value in table.items()}
+    note = ""
+    if "obj_pose" not in table:
+        # Newer files name a scene in its place.
+        scene = content.table.get("scene_path")
+        if not isinstance(scene, str):
+            raise FileError(content.path, "obj_pose", "neither it nor a scene_path", "where the object stands")
+        thing = placed(content.path, scene)
+        note, name = thing.note, name or thing.name
+        table = {"obj_scale": thing.scale} | table | {"obj_pose": thing.pose}
     table["object_name"] = name if isinstance(name, str) else np.asarray(name)
     table.setdefault("obj_scale", np.nan)
-    return grasps_of_columns(content.path, table)
+    return replace(grasps_of_columns(content.path, table), notes=(note,) if note else ())
 
 
 def one_row(value: object) -> object:

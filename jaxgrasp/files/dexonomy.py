@@ -6,6 +6,7 @@ Contacts (`obj_cpn_w` (n, 6) and others) travel along. Older files have a scene 
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ def read(content: Content, given: Given) -> GraspSet:
         field = name + STAGE
         if name != GRASP and field not in table:
             continue
-        rows = table.get(field)
+        rows: Any = table.get(field)
         rows = rows[None] if isinstance(rows, np.ndarray) and rows.ndim == 1 else rows
         if not isinstance(rows, np.ndarray) or rows.ndim != 2 or not len(rows):
             raise FileError(path, field, f"shape {np.shape(rows)}", "(K, 7 + joints)")

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.files.columns import numbers
-from jaxgrasp.files.grasp_set import GRASP, GraspSet, HandPoses
+from jaxgrasp.files.columns import numbers, text_array
+from jaxgrasp.files.grasp_set import GRASP, HandPoses
 from jaxgrasp.storage import FileError, printable
 
 
@@ -74,7 +74,7 @@ def checked_joints(path: Path, field: str, names: Sequence[object]) -> tuple[str
     """
     if not 0 < len(names) <= _JOINTS or not all(isinstance(name, str) for name in names):
         raise FileError(path, field, f"{len(names)} names of joints", f"text, 1 to {_JOINTS} of them")
-    return tuple(printable(name) for name in names)
+    return tuple(text_array(path, field, [printable(name) for name in names]).tolist())
 
 
 def stacked(path: Path, field: str, rows: Sequence[Mapping[str, object]], names: Sequence[str]) -> np.ndarray:
@@ -92,17 +92,6 @@ def stacked(path: Path, field: str, rows: Sequence[Mapping[str, object]], names:
             )
     table = numbers(path, field, [[row[name] for name in names] for row in rows])
     return table.reshape(len(rows), len(names))
-
-
-def refuse_empty(path: Path, field: str, grasps: GraspSet) -> GraspSet:
-    """The grasps, of which there must be one at least.
-
-    Raises:
-        FileError: There is none.
-    """
-    if not len(grasps):
-        raise FileError(path, field, "no grasps", "at least one")
-    return grasps
 
 
 _JOINTS = 1_000

@@ -1,6 +1,6 @@
 """What files of grasps leave open, and whoever reads them can say."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -15,6 +15,10 @@ from jaxgrasp.storage import FileError
 if TYPE_CHECKING:
     from jaxgrasp.hands.hand_frames import HandFrames
 
+WORLD = "world"
+"""Name of the world of a hand's file among its links."""
+_ASSUMED = "{} is taken to stand in the world of the hand's file, which --hand would look up"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Given:
@@ -22,6 +26,8 @@ class Given:
 
     hand: str | PathLike | None = None
     """Its file or name; None where nobody has said it."""
+    assumed: set[str] = field(default_factory=set)
+    """What was taken to be so, since nobody has said which hand it is."""
 
     @cached_property
     def _frames(self) -> "HandFrames | None":
@@ -49,6 +55,8 @@ class Given:
             ValueError: The hand cannot be read.
         """
         if self._frames is None:
+            if link != WORLD:
+                self.assumed.add(_ASSUMED.format(link or "the hand's first link"))
             return poses
         try:
             place = self._frames.pose(link)

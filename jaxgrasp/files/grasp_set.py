@@ -87,7 +87,7 @@ class GraspSet:
             return replace(self, object_scale=np.full(len(self), float(scale)))
         unsaid = np.flatnonzero(np.isnan(self.object_scale))
         if len(unsaid):
-            file = self.source[unsaid[0]].rpartition(":")[0]
+            file = str(self.source[unsaid[0]]).rpartition(":")[0]
             raise FileError(
                 file, "object_scale", "no scale of the object, which this format does not say", "with_scale (--scale)"
             )

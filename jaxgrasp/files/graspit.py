@@ -30,7 +30,8 @@ _LONGEST = 10_000
 
 def recognises(content: Content) -> bool:
     """Whether the content is of this format."""
-    return content.kind == "xml" and bool(content.data) and content.data[-1][0] == "world"
+    data = content.data
+    return content.kind == "xml" and isinstance(data, list) and bool(data) and data[-1][0] == "world"
 
 
 def read(content: Content, given: Given) -> GraspSet:

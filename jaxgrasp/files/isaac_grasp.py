@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.files.columns import numbers, per_grasp, sources
+from jaxgrasp.files.columns import numbers, per_grasp, sources, text_array
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.fields import array, checked_joints, part, stacked
 from jaxgrasp.files.frames import standing
-from jaxgrasp.files.given import Given
+from jaxgrasp.files.given import WORLD, Given
 from jaxgrasp.files.grasp_set import GRASP, GraspSet, HandPoses
 from jaxgrasp.storage import FileError, printable
 
@@ -62,7 +62,7 @@ def read(content: Content, given: Given) -> GraspSet:
         joint_names=names,
         object_pose=standing(count),
         object_scale=per_grasp(path, "object_scale", scales, count),
-        object_name=np.array([printable(row.get("object_file", name)) for row in rows]),
+        object_name=text_array(path, "object_file", [printable(row.get("object_file", name)) for row in rows]),
         source=sources(path, count),
         columns={str(name): column for name, column in columns.items()},
         notes=notes,
@@ -105,4 +105,4 @@ def _frame(table: Mapping[str, Any], name: str) -> str | None:
 
 def _link(table: Mapping[str, Any], given: Given) -> str | None:
     link = _frame(table, "gripper_frame")
-    return link if link is not None and given.has_link(link) else "world"
+    return link if link is not None and given.has_link(link) else WORLD

@@ -1,7 +1,9 @@
 """Writing isaac_grasp: one YAML file for each object and scale, with every digit of every number."""
 
 import re
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -20,7 +22,7 @@ def write(grasps: GraspSet, path: Path, progress: Callable[[int], None]) -> list
     """Writes grasps, whose poses become those of the hand file's world in the object's frame.
 
     Args:
-        grasps: The grasps, with names of their joints.
+        grasps: The grasps; joints without names are called `dof_0`, `dof_1`, ...
         path: A file of one of `ENDINGS`, or a folder, in which each object and scale has a file.
         progress: Called after each file with how many grasps are written.
 
@@ -28,37 +30,38 @@ def write(grasps: GraspSet, path: Path, progress: Callable[[int], None]) -> list
         What this format cannot say.
 
     Raises:
-        ValueError: The joints have no names.
         OSError: A file cannot be written.
     """
+    lost = _lost(grasps)
     if grasps.joint_names is None:
-        raise ValueError(f"{NAME}: got joints without names, wanted the hand, whose file has them: --hand")
-    pairs = list(zip(grasps.object_name.tolist(), grasps.object_scale.tolist(), strict=True))
-    objects = list(dict.fromkeys(pairs))
+        grasps = replace(grasps, joint_names=tuple(f"dof_{k}" for k in range(grasps.stages[GRASP].joints.shape[1])))
+    rows: dict[tuple[str, float], list[int]] = {}
+    for row, which in enumerate(zip(grasps.object_name.tolist(), grasps.object_scale.tolist(), strict=True)):
+        rows.setdefault(which, []).append(row)
     if path.suffix in ENDINGS:
-        _write_file(grasps, path, single=len(objects) == 1)
+        _write_file(grasps, path, single=len(rows) == 1)
         progress(len(grasps))
-        several = ["that files have one object and scale (each grasp has its own)"] if len(objects) > 1 else []
-        return [*_lost(grasps), *several]
+        return [*lost, "that files have one object and scale (each grasp has its own)"] if len(rows) > 1 else lost
     path.mkdir(parents=True, exist_ok=True)
     done = 0
-    for which, name in zip(objects, _names(objects), strict=True):
-        part = grasps.take(np.array([pair == which for pair in pairs]))
-        _write_file(part, path / name, single=True)
-        done += len(part)
+    for own, name in zip(rows.values(), _names(list(rows)), strict=True):
+        _write_file(grasps.take(np.array(own)), path / name, single=True)
+        done += len(own)
         progress(done)
-    return _lost(grasps)
+    return lost
 
 
 def _names(objects: list[tuple[str, float]]) -> list[str]:
     """A file name for each object and scale, no two alike."""
-    found: list[str] = []
+    scales = Counter(name for name, _ in objects)
+    taken: Counter[str] = Counter()
+    found = []
     for name, scale in objects:
         stem = re.sub(r"[^\w.-]", "_", PurePosixPath(name.replace("\\", "/")).stem)[:100].lstrip(".") or "object"
-        several = len({other for word, other in objects if word == name}) > 1
-        base = f"{stem}_scale{scale:g}" if several else stem
-        taken = sum(other.rpartition("~")[0] == base or other == f"{base}.yaml" for other in found)
-        found.append(f"{base}~{taken}.yaml" if taken else f"{base}.yaml")
+        base = f"{stem}_scale{scale:g}" if scales[name] > 1 else stem
+        number = taken[base]
+        taken[base] += 1
+        found.append(f"{base}~{number}.yaml" if number else f"{base}.yaml")
     return found
 
 
@@ -115,7 +118,8 @@ def _quoted(text: str) -> str:
 
 
 def _lost(grasps: GraspSet) -> list[str]:
-    lost = [f"the stage {name}" for name in grasps.stages if name not in JOINTS]
+    lost = [] if grasps.joint_names is not None else ["which joints these are (--hand has their names)"]
+    lost += [f"the stage {name}" for name in grasps.stages if name not in JOINTS]
     if "pregrasp" in grasps.stages and (grasps.stages["pregrasp"].base != grasps.stages[GRASP].base).any():
         lost.append("where the base stands before the grasp")
     if (grasps.object_pose != standing(1)).any():

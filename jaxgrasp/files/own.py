@@ -1,6 +1,7 @@
 """Our own files: `.npz`, Parquet, CSV and HDF5 with the columns of `columns`."""
 
 import re
+from typing import Any
 
 from jaxgrasp.files.columns import STAGE, grasps_of_columns
 from jaxgrasp.files.content import Content
@@ -22,7 +23,7 @@ def read(content: Content, given: Given) -> GraspSet:
         FileError: A field cannot be used.
     """
     table = dict(content.table)
-    names = table.get("joint_names")
+    names: Any = table.get("joint_names")
     if content.kind == "table" and getattr(names, "ndim", 0) in (1, 2):
         # A table has a row for every grasp: the same names in each.
         names = names[0] if names.ndim == 2 else re.split(r"\s*;\s*|\s+", names[0])

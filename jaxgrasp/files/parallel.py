@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.files.columns import numbers, sources, travelling
+from jaxgrasp.files.columns import numbers, sources, texts, travelling
 from jaxgrasp.files.content import Content
 from jaxgrasp.files.fields import array, part, single_stage
 from jaxgrasp.files.frames import of_transforms, standing
@@ -56,9 +56,11 @@ def read_graspgen(content: Content, given: Given) -> GraspSet:
         FileError: A field cannot be used.
     """
     path, grasps = content.path, part(content.path, content.table, "grasps")
-    thing = part(path, content.table, "object")
-    scale = uniform(path, "object.scale", part(path, thing, "scale", (int, float, list), "object."))
-    name = part(path, thing, "file", str, "object.")
+    scale, name = np.nan, path.stem
+    if "object" in content.table:
+        thing = part(path, content.table, "object")
+        scale = uniform(path, "object.scale", part(path, thing, "scale", (int, float, list), "object."))
+        name = part(path, thing, "file", str, "object.")
     others = {
         str(field): np.array(value)
         for field, value in grasps.items()
@@ -87,7 +89,7 @@ def _read(
         joint_names=(),
         object_pose=standing(count),
         object_scale=np.full(count, scale),
-        object_name=np.full(count, printable(name)),
+        object_name=texts(path, "object file", printable(name), count),
         source=sources(path, count),
         columns=travelling(others, count),
     )

@@ -10,7 +10,7 @@ counted.
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -222,7 +222,7 @@ class _Machine:
                 self._refuse(f"a key of type {type(key).__name__}")
             table[key] = value
 
-    def _top(self, kind: type) -> list | dict:
+    def _top(self, kind: type) -> Any:
         top = self._stack[-1]
         # Types that Python's own subclasses could stand in for never come to be here.
         if type(top) is not kind:
@@ -365,7 +365,8 @@ _LEAVES = (str, bytes, int, float, bool, type(None))
 
 def _check_tree(path: Path, tree: object) -> None:
     """Refuses what is deep, goes in circles, repeats itself without end, or has anything but data in it."""
-    level, seen, most, size = [tree], 0, max(1, allowance() // _PER_OPCODE), 0
+    level: list[Any] = [tree]
+    seen, most, size = 0, max(1, allowance() // _PER_OPCODE), 0
     for _ in range(_DEPTH):
         below: list = []
         for value in level:

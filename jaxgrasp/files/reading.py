@@ -1,8 +1,11 @@
 """Files of grasps in, one set of grasps out: the format is looked up by the content of each file."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+
+import numpy as np
 
 from jaxgrasp.files.content import read_content
 from jaxgrasp.files.formats import format_of, named
@@ -45,6 +48,8 @@ def read_grasps(
         try:
             content = read_content(path)
             part = (chosen or format_of(content)).read(content, given)
+            _check_scales(path, part)
+            parts, part = _named_alike(parts, part, given)
             parts.append(in_order_of(parts[0], part) if parts else part)
         except FileError as error:
             if skipped is None:
@@ -54,4 +59,24 @@ def read_grasps(
             progress(number + 1, len(files))
     if not parts:
         raise FileError(", ".join(map(str, words)) or "grasps", None, "no grasps at all", "files of grasps")
-    return concatenate(parts)
+    found = concatenate(parts)
+    return replace(found, notes=(*found.notes, *sorted(given.assumed)))
+
+
+def _check_scales(path: Path, part: GraspSet) -> None:
+    """Refuses scales with which there is no object; those that a file does not say are no numbers."""
+    wrong = np.flatnonzero((part.object_scale <= 0) | np.isinf(part.object_scale))
+    if len(wrong):
+        raise FileError(path, "object_scale", f"{part.object_scale[wrong[0]]:g} in row {wrong[0]}", "a number above 0")
+
+
+def _named_alike(parts: list[GraspSet], part: GraspSet, given: Given) -> tuple[list[GraspSet], GraspSet]:
+    """Names joints by the hand, where there is one, in files without names that lie beside files with names."""
+    names = None
+    if parts and (parts[0].joint_names is None) != (part.joint_names is None):
+        names = given.names_in_order()
+    if names is None:
+        return parts, part
+    if part.joint_names is None:
+        return parts, part.for_hand(names)
+    return [other.for_hand(names) for other in parts], part.for_hand(names)

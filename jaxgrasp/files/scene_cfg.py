@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from jaxgrasp.files.columns import numbers
+from jaxgrasp.files.columns import numbers, text_array
 from jaxgrasp.files.content import read_content
 from jaxgrasp.files.fields import array, part
 from jaxgrasp.files.grasp_set import STANDING
@@ -51,7 +51,9 @@ def object_of(path: Path, scene: object, where: str = "scene_cfg") -> Placed:
     inside = f"{where}.scene.{name}."
     thing = part(path, things, name, dict, f"{where}.scene.")
     scale = uniform(path, f"{inside}scale", thing.get("scale", np.nan))
-    return Placed(str(name), array(path, thing, "pose", (7,), inside), scale)
+    return Placed(
+        str(text_array(path, f"{where}.task.obj_name", name)), array(path, thing, "pose", (7,), inside), scale
+    )
 
 
 def uniform(path: Path, field: str, value: object) -> float:

@@ -7,6 +7,7 @@ seconds the process may take. It exits with 1, and says why on standard output, 
 import re
 import sys
 import zipfile
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,8 @@ def _hdf5(path: str, budget: int) -> dict[str, np.ndarray]:
     left = budget
     with h5py.File(path, "r") as file:
         # Groups to look into; addresses, since a group may be linked into itself.
-        waiting, seen = [("", file)], set()
+        waiting: list[tuple[str, Any]] = [("", file)]
+        seen: set[int] = set()
         while waiting:
             prefix, group = waiting.pop()
             if group.id.__hash__() in seen or len(seen) > _COLUMNS:
@@ -46,13 +48,13 @@ def _hdf5(path: str, budget: int) -> dict[str, np.ndarray]:
                 link = group.get(name, getlink=True)
                 if not isinstance(link, h5py.HardLink):
                     raise _Refused(f"a link to elsewhere ({prefix}{name})")
-                part = group[name]
+                part: Any = group[name]
                 if isinstance(part, h5py.Group):
                     waiting.append((f"{prefix}{name}/", part))
                 elif isinstance(part, h5py.Dataset):
                     if part.external or part.is_virtual:
                         raise _Refused(f"data that lie in other files ({prefix}{name})")
-                    left -= 8 * part.size if part.shape is not None else 0
+                    left -= 8 * (part.size or 0)
                     if left < 0 or len(found) >= _COLUMNS:
                         raise _Refused("data that are too large or too many (see --read-limit)")
                     value = _dataset(h5py, part)
@@ -75,8 +77,11 @@ def _parquet(path: str, budget: int) -> dict[str, np.ndarray]:
 
     with parquet.ParquetFile(path, memory_map=False) as file:
         about = file.metadata
-        size = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
-        if max(size, 8 * about.num_rows * about.num_columns) > budget or about.num_columns > _COLUMNS:
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        size = sum(group.total_byte_size for group in groups)
+        # Lists have more values than rows, and numbers that repeat take hardly any bytes.
+        count = sum(group.column(j).num_values for group in groups for j in range(about.num_columns))
+        if max(size, 8 * count) > budget or about.num_columns > _COLUMNS:
             raise _Refused("data that are too large or too many (see --read-limit)")
         table = file.read(use_threads=False)
     return _joined(table, budget)
@@ -167,4 +172,4 @@ def main(kind: str, path: str, result: str, budget: int, memory: int, seconds: i
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:4], *map(int, sys.argv[4:7])))
+    sys.exit(main(sys.argv[1], sys.argv[2], sys.argv[3], *map(int, sys.argv[4:7])))

@@ -15,8 +15,8 @@ from jaxgrasp.storage import FileError, allowance, open_regular
 # An entry of a list takes some hundred bytes of memory: together a sixteenth of the budget.
 _PER_ENTRY = 16 * 128
 _DEPTH = 16
-# Of the parser of YAML, beside which there are lines of text and marks.
-_YAML_COST = 32
+# One character beyond the first 65,536 makes four bytes of every other one of its text, and parsers keep that twice.
+_COST = 64
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 _WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
 _REALS = {".nan": "nan", ".inf": "inf", "-.inf": "-inf", "+.inf": "inf"}
@@ -29,7 +29,7 @@ def read_json(path: Path) -> object:
         FileError: It is damaged, too large or too deep.
     """
     wanted = "intact JSON"
-    content = _content(path, wanted, 8)
+    content = _content(path, wanted, _COST)
     _check_count(path, content.count(b",") + content.count(b"[") + content.count(b"{"))
     try:
         return json.loads(content)
@@ -49,7 +49,7 @@ def read_yaml(path: Path) -> object:
     except ImportError as error:
         raise FileError(path, None, "YAML, which PyYAML reads", "pip install 'jaxgrasp[files]'") from error
     wanted = "intact YAML without tags and anchors"
-    content = _content(path, wanted, _YAML_COST)
+    content = _content(path, wanted, _COST)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         return _built(path, yaml.parse(content, Loader=loader), wanted)
@@ -70,7 +70,7 @@ def read_xml(path: Path) -> list[tuple[str, str]]:
         FileError: It is damaged, too large or too deep, or has a document type.
     """
     wanted = "well-formed XML without a document type"
-    content = _content(path, wanted, _YAML_COST)
+    content = _content(path, wanted, _COST)
     _check_count(path, content.count(b"<"))
     found: list[tuple[str, str]] = []
     open_tags: list[str] = []

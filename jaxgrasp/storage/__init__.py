@@ -1,6 +1,7 @@
 """The disk: the one writer and the one reader of the package, and the folder of what is kept between runs."""
 
 from jaxgrasp.storage.arrays import (
+    PICKLE_COST,
     Archive,
     Header,
     array_of_bytes,
@@ -15,6 +16,7 @@ from jaxgrasp.storage.reading import FileError, allowance, limited_to, open_regu
 from jaxgrasp.storage.writing import atomic_write, check_writable, discard_unfinished, unfinished
 
 __all__ = [
+    "PICKLE_COST",
     "Archive",
     "FileError",
     "Header",

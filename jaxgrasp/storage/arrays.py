@@ -31,6 +31,8 @@ _MEMBERS, _DIRECTORY = 2_000, 4 << 20
 # Archives of zeros shrink a thousandfold; grasps, hardly at all. Small members, such as a constant column of a million
 # candidates, may shrink as they like.
 _INFLATION, _SMALL = 100, 256 << 20
+PICKLE_COST = 16
+"""Bytes of memory that a byte of a pickle, or of an archive with one, may come to take in other types and objects."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,7 @@ def read_objects(path: Path | str) -> tuple[Header, bytes]:
         FileError: The file is absent, unreadable, of another kind or too large.
     """
     path, wanted = Path(path), "an .npy file of numpy.save"
-    with open_regular(path, wanted, cost=2) as stream:
+    with open_regular(path, wanted, cost=PICKLE_COST) as stream:
         content = stream.read()
     if not content.startswith(_MAGIC):
         raise FileError(path, None, "a file of another kind" if content else "an empty file", wanted)
@@ -245,7 +247,7 @@ def read_members(path: Path | str, wanted: str) -> dict[str, bytes]:
         FileError: The file is absent, unreadable, no archive, damaged, compressed or too large.
     """
     path = Path(path)
-    with open_regular(path, wanted, cost=2) as stream:
+    with open_regular(path, wanted, cost=PICKLE_COST) as stream:
         try:
             size = stream.seek(0, io.SEEK_END)
             with zipfile.ZipFile(_Bounded(stream)) as archive:  # type: ignore[arg-type]
