@@ -26,6 +26,7 @@ FLOORS = {
     "metrics": 4,
     "hands": 4,
     "candidates": 4,
+    "files": 5,
     "simulation": 5,
     "synthesis": 6,
     "ranking": 6,

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from jaxgrasp.cli import main
+from jaxgrasp.files import read_grasps, write_grasps
 from jaxgrasp.hands import Scene
 from jaxgrasp.synthesis import HandSynthesis
 
@@ -88,10 +89,15 @@ def test_compare_takes_the_same_and_leaves_nothing_out(folder, capsys):
         (["--condim", "2"], "--condim: got 2, wanted 1, 3, 4 or 6"),
         (["--hand-body", "wrist"], "hand_body: got 'wrist', wanted one of the scene's bodies"),
         (["--environment", "shelf"], "environment: got 'shelf', wanted one of the scene's bodies"),
-        (["--grasps", "short.npz"], "short.npz: grasp_qpos: got float64 (2, 9); wanted (N, 11): the pose of the base"),
-        (["--grasps", "named.npz"], "named.npz: joints: got 'x', wanted some of j0, j1, j2, j3"),
-        (["--grasps", "none.npz"], "none.npz: got fields qpos; wanted grasp_qpos"),
+        (
+            ["--grasps", "short.npz"],
+            "short.npz: joints: got 2 joints without names; wanted 4, those of the hand: j0",
+        ),
+        (["--grasps", "named.npz"], "named.npz: joints: got 'x'; wanted some of the hand's: j0, j1, j2, j3"),
+        (["--grasps", "none.npz"], "none.npz: got a file of no format that is known (qpos)"),
         (["--grasps", "nix.npz"], "nix.npz"),
+        (["--grasps", "nix*.npz"], "nix*.npz: got a pattern that no file fits"),
+        (["--grasp-format", "nix"], "--grasp-format: got 'nix', wanted one of"),
         (["--scene", "four_fingers"], "--hand: got --scene, too"),
         (["--engine", "mjx"], "only where they penetrate, and contacts up to 0.005 m apart are wanted"),
         (["--engine", "bullet"], "--engine: got bullet; wanted one of mujoco, distance"),
@@ -107,6 +113,23 @@ def test_what_cannot_be_used_is_one_line(folder, capsys, change, message):
     assert main(["rank", *COMMAND, "--picture", "None", "--figure", "None", *change]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and error.startswith("jaxgrasp: ") and message in error
+
+
+def test_folders_of_other_formats_with_a_bad_file_among_them(folder, capsys):
+    grasps = read_grasps("grasps.npz")
+    write_grasps(grasps, "bench", "dexgraspbench", hand="hand.xml")
+    (folder / "bench" / "8.npy").write_bytes((folder / "bench" / "7.npy").read_bytes()[:-40])
+    command = ["rank", *COMMAND[:-1], "bench", "--min-contacts", "0", "--output", "table.npz"]
+    command += ["--figure", "None", "--picture", "None"]
+    assert main(command) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "bench/8.npy: pickle: got data that end early" in told
+    assert main([*command, "--keep-going"]) == 2
+    told = capsys.readouterr()
+    assert "bench/8.npy: pickle: got" in told.err and "written: table.npz" in told.out
+    with np.load("table.npz") as table:
+        assert sorted(table["source"].tolist()) == [f"bench/{k}.npy" for k in range(8)]
+        assert table["succ_flag"].sum() == 4 and set(table["obj_scale"].tolist()) == {0.05, 0.06}
 
 
 def test_a_hand_wants_an_object_and_grasps(folder, capsys):

@@ -98,7 +98,7 @@ def forked(case: Case, good: Path, home: Path) -> Outcome:
         finally:
             sys.stderr.flush()
             os._exit(code)
-    code, usage = _wait(child, begun)
+    code, usage = wait(child, begun)
     errors = (home / "err").read_text("utf-8", "replace")
     wrong = _wrongly_accepted(case) if code == 0 else ""
     return Outcome(case, code, errors, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, wrong)
@@ -112,13 +112,13 @@ def commanded(case: Case, good: Path, home: Path) -> Outcome:
         command += ["--samples", "8"] if case.kind == "xml" else ["--starts", "8", "--steps", "10"]
     with open(home / "err", "w") as errors:
         process = subprocess.Popen(command, cwd=home, stdout=subprocess.DEVNULL, stderr=errors)
-        code, usage = _wait(process.pid, begun)
+        code, usage = wait(process.pid, begun)
         process.returncode = code
     text = (home / "err").read_text("utf-8", "replace")
     return Outcome(case, code, text, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, "")
 
 
-def _wait(child: int, begun: float) -> tuple[int, resource.struct_rusage]:
+def wait(child: int, begun: float) -> tuple[int, resource.struct_rusage]:
     while True:
         found, status, usage = os.wait4(child, os.WNOHANG)
         if found:

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli.metrics import metric_names, scores_of
-from jaxgrasp.cli.problems import CommandError, check_output, warn_of_conventions, write_files
+from jaxgrasp.cli.problems import CommandError, Skipped, check_output, warn_of_conventions, write_files
 from jaxgrasp.cli.scene import ComparedScene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import printing
@@ -94,7 +94,7 @@ class Compare(Reading):
         """Computes, writes and prints.
 
         Returns:
-            The exit code: 0, or 2 where a file could not be written in the end.
+            The exit code: 0, or 2 where a file could not be written in the end, or was passed over.
 
         Raises:
             CommandError: The options or the files cannot be used.
@@ -112,8 +112,9 @@ class Compare(Reading):
 
         try:
             disturbances, _ = named_disturbances(self.disturbances)
+            skipped = Skipped()
             if self.of_hand.given:
-                candidates, _ = self.of_hand.candidates(self.friction, self.max_force)
+                candidates, _ = self.of_hand.candidates(self.friction, self.max_force, skipped)
             else:
                 candidates = read_candidates(
                     self.files, friction=self.friction, max_force=self.max_force, with_mass=self.gravity != 0.0
@@ -141,7 +142,7 @@ class Compare(Reading):
         )
         with printing():
             print_comparison(found, outcome, len(candidates), written)
-        return 2 if failed else 0
+        return 2 if failed else skipped.exit_code()
 
     def _check(self) -> None:
         checks = [

@@ -1,25 +1,35 @@
 """Grasps of files with a hand and an object of one's own: one scene a scale."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxgrasp.cli.problems import CommandError
+from jaxgrasp.cli.problems import CommandError, Skipped
+from jaxgrasp.cli.streams import one_line
+from jaxgrasp.storage import FileError
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.cli.scene import GivenScene
+    from jaxgrasp.files import GraspSet
     from jaxgrasp.hands import HandObject, Scene
 
-_STAGE = "grasp_qpos"
-_POSE = 7
+_NOTES = 3
 
 
 def candidates_of_grasps(
-    options: "GivenScene", friction: float | None, max_force: float | None
+    options: "GivenScene", friction: float | None, max_force: float | None, skipped: Skipped | None = None
 ) -> "tuple[Candidates, list[HandObject]]":
     """The candidates of all files of grasps, in their order, and the scenes that they are of.
+
+    Args:
+        options: The hand, the object and the files.
+        friction: Of every contact; None is the models'.
+        max_force: Of every contact, N.
+        skipped: Told of files that cannot be used; None raises.
 
     Raises:
         CommandError: A file or the scene cannot be used.
@@ -28,79 +38,120 @@ def candidates_of_grasps(
     from jaxgrasp.cli.report import counting_bar
     from jaxgrasp.ranking.configurations import candidates_of
 
-    tables = [_table(path) for path in options.grasps]
-    scales = [_scales(options, table) for table in tables]
+    assert options.object is not None
+    grasps = grasps_of_files(
+        options.grasps, options.grasp_format, hand=options.hand, scale=options.scale, skipped=skipped
+    )
     hands: list[HandObject] = []
     parts, order = [], []
-    starts = np.cumsum([0, *map(len, scales)])
-    assert options.object is not None
-    with counting_bar("finding contacts", int(starts[-1])) as progress:
+    with counting_bar("finding contacts", len(grasps)) as progress:
         done = 0
-        for scale in np.unique(np.concatenate(scales)):
+        for scale in np.unique(grasps.object_scale):
             built = options.built(options.object, float(scale), friction)
-            chosen = []
-            for path, table, own, start in zip(options.grasps, tables, scales, starts, strict=False):
-                rows = np.flatnonzero(own == scale)
-                if len(rows):
-                    chosen.append((path, table, rows, start, _configurations(path, built, table)[rows]))
+            rows = np.flatnonzero(grasps.object_scale == scale)
+            chosen = grasps.take(rows)
+            qpos = configurations(built, chosen)
+            # Tables have no names of joints: theirs are in the hand's order.
+            chosen = chosen.for_hand(built.joint_names)
             hands.append(options.hand_of(built.model, None, max_force))
-            for path, table, rows, start, qpos in chosen:
-                columns = {name: x[rows] for name, x in table.items() if name not in ("joint_names", "obj_scale")}
-                columns |= {"scene": np.full(len(rows), len(hands) - 1), "obj_scale": np.full(len(rows), scale)}
-                parts.append(
-                    candidates_of(
-                        hands[-1],
-                        qpos,
-                        source=str(path),
-                        limited=options.actuators,
-                        columns=columns,
-                        engine=options.engine,
-                        index=rows,
-                    )
+            parts.append(
+                candidates_of(
+                    hands[-1],
+                    qpos,
+                    source="",
+                    limited=options.actuators,
+                    columns=_travelling(chosen) | {"scene": np.full(len(rows), len(hands) - 1)},
+                    engine=options.engine,
                 )
-                order.append(start + rows)
-                done += len(rows)
-                progress(done)
-    found = concatenate(parts)
-    return found.take(np.argsort(np.concatenate(order))), hands
+            )
+            order.append(rows)
+            done += len(rows)
+            progress(done)
+    found = concatenate(parts).take(np.argsort(np.concatenate(order)))
+    files, source, index = _sources(grasps)
+    return replace(found, sources=files, source=source, index=index), hands
 
 
-def _table(path: Path) -> dict[str, np.ndarray]:
-    from jaxgrasp.candidates import CandidateError
-    from jaxgrasp.storage import read_archive
+def grasps_of_files(
+    paths: Sequence[Path],
+    format: str | None = None,
+    *,
+    hand: str | None = None,
+    scale: float | None = None,
+    skipped: Skipped | None = None,
+    option: str = "--grasp-format",
+) -> "GraspSet":
+    """Reads grasps of files in any format that is known, with a bar.
+
+    Args:
+        paths: Files, folders and patterns.
+        format: The format of all of them; None looks at the content.
+        hand: The hand's file or name.
+        scale: Of the object; None is the files' own.
+        skipped: Told of files that cannot be used, which are then passed over; None raises what is wrong with the
+            first one.
+        option: The option that says the format.
+
+    Raises:
+        CommandError: A file cannot be used.
+    """
+    from jaxgrasp.cli.report import counting_bar
+    from jaxgrasp.files import read_grasps
 
     try:
-        table = read_archive(path)
-    except CandidateError as error:
-        raise CommandError(str(error)) from error
-    count = len(table[_STAGE]) if _STAGE in table and table[_STAGE].ndim else 0
-    if not count:
-        raise CommandError(f"{path}: got fields {', '.join(table) or 'none'}; wanted {_STAGE} (N, 7 + joints)")
-    # What is the same for all grasps, or of another length, does not travel along.
-    return {name: x for name, x in table.items() if name == "joint_names" or (x.ndim and len(x) == count)}
-
-
-def _scales(options: "GivenScene", table: dict[str, np.ndarray]) -> np.ndarray:
-    count = len(table[_STAGE])
-    if options.scale is not None:
-        return np.full(count, options.scale)
-    given = table.get("obj_scale")
-    if given is None or given.ndim != 1 or given.dtype.kind not in "fiu":
-        return np.ones(count)
-    return given.astype(float)
-
-
-def _configurations(path: Path, built: "Scene", table: dict[str, np.ndarray]) -> np.ndarray:
-    stage, names = table[_STAGE], table.get("joint_names")
-    count = len(built.joint_names) if names is None else len(names)
-    if stage.ndim != 2 or stage.shape[1] != _POSE + count or stage.dtype.kind not in "fiu":
-        wanted = ", ".join(built.joint_names if names is None else map(str, names))
-        raise CommandError(
-            f"{path}: {_STAGE}: got {stage.dtype} {stage.shape}; wanted (N, {_POSE + count}): the pose of the base, "
-            f"then {wanted}"
-        )
-    joints = stage[:, _POSE:] if names is None else dict(zip(map(str, names), stage[:, _POSE:].T, strict=True))
-    try:
-        return built.qpos(base=stage[:, :_POSE], joints=joints, object=table.get("obj_pose"))
+        with counting_bar("reading grasps", len(paths)) as progress:
+            found = read_grasps(paths, format, hand=hand, skipped=skipped, progress=progress)
+        _tell(found.notes)
+        return found.with_scale(scale)
     except ValueError as error:
-        raise CommandError(f"{path}: {error}") from error
+        text = str(error)
+        raise CommandError(f"{option}: {text[8:]}" if text.startswith("format: ") else _as_option(text)) from error
+
+
+def configurations(built: "Scene", grasps: "GraspSet", stage: str = "grasp") -> np.ndarray:
+    """Configurations (N, nq) of a scene.
+
+    Args:
+        built: A scene of the grasps' hand, and of the object in their scale.
+        grasps: The grasps.
+        stage: Which of their stages.
+
+    Raises:
+        CommandError: The hand has other joints.
+    """
+    try:
+        own = grasps.for_hand(built.joint_names)
+        return built.qpos(base=own.stages[stage].base, joints=own.joints_by_name(stage), object=own.object_pose)
+    except FileError as error:
+        raise CommandError(str(error)) from error
+    except ValueError as error:
+        raise CommandError(f"{grasps.source[0].rpartition(':')[0]}: {error}") from error
+
+
+def _tell(notes: Sequence[str]) -> None:
+    """Prints the first few on standard error."""
+    for note in notes[:_NOTES]:
+        one_line(note)
+    if len(notes) > _NOTES:
+        one_line(f"... and {len(notes) - _NOTES:,} more like these")
+
+
+def _as_option(text: str) -> str:
+    """What is wrong with the hand, with the option that names it."""
+    return f"--{text}" if text.startswith("hand: ") else text
+
+
+def _travelling(grasps: "GraspSet") -> dict[str, np.ndarray]:
+    """The columns that a table has beside its own."""
+    from jaxgrasp.files.columns import columns_of_grasps
+
+    table = columns_of_grasps(grasps)
+    return {name: column for name, column in table.items() if name != "joint_names"}
+
+
+def _sources(grasps: "GraspSet") -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Files in the order of their first grasps, and for each grasp the number of its file and its row there."""
+    parted = [text.rpartition(":") for text in grasps.source.tolist()]
+    number = {file: k for k, file in enumerate(dict.fromkeys(file for file, _, _ in parted))}
+    source = np.array([number[file] for file, _, _ in parted])
+    return tuple(number), source, np.array([int(row) for _, _, row in parted])

@@ -19,6 +19,24 @@ class CommandError(Exception):
     exit_code = 2
 
 
+class Skipped:
+    """Files that were passed over, each with a line on standard error."""
+
+    def __init__(self) -> None:
+        """Starts with none."""
+        self.count = 0
+        """How many there were."""
+
+    def __call__(self, error: Exception) -> None:
+        """Tells what is wrong with one."""
+        self.count += 1
+        one_line(error)
+
+    def exit_code(self) -> int:
+        """2 where files were passed over, else 0."""
+        return 2 if self.count else 0
+
+
 def check_options(*checks: tuple[str, object, bool, str]) -> None:
     """Refuses values that cannot be used.
 

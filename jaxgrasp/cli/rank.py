@@ -10,7 +10,7 @@ import tyro
 
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.metrics import metric_names, scores_of
-from jaxgrasp.cli.problems import CommandError, check_options, check_output, warn_of_conventions, write_files
+from jaxgrasp.cli.problems import CommandError, Skipped, check_options, check_output, warn_of_conventions, write_files
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import one_line, printing
@@ -82,7 +82,7 @@ class Rank(Reading):
 
         Returns:
             The exit code: 0, 130 after Ctrl-C, 1 after an error of the computation, 2 where a file could not be written
-            in the end.
+            in the end, or was passed over.
 
         Raises:
             CommandError: The options or the files cannot be used.
@@ -95,10 +95,11 @@ class Rank(Reading):
 
         clock = Clock()
         hands: list[HandObject] = []
+        skipped = Skipped()
         try:
             disturbances, unit = named_disturbances(self.disturbances)
             if self.of_hand.given:
-                candidates, hands = self.of_hand.candidates(self.friction, self.max_force)
+                candidates, hands = self.of_hand.candidates(self.friction, self.max_force, skipped)
             else:
                 candidates = self._candidates()
         except CandidateError as error:
@@ -108,7 +109,7 @@ class Rank(Reading):
         clock.lap()
         metrics = scores_of(candidates, names, disturbances, gravity=self.gravity, cone_edges=self.cone_edges)
         clock.lap("metrics" if metrics else "")
-        return self._rank(candidates, disturbances, unit, hands, metrics, clock)
+        return self._rank(candidates, disturbances, unit, hands, metrics, clock) or skipped.exit_code()
 
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS

@@ -81,7 +81,7 @@ def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
-def counting_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+def counting_bar(what: str, total: int) -> Iterator[Callable[..., None]]:
     """Shows a bar on standard error where that is a terminal.
 
     Args:
@@ -89,13 +89,13 @@ def counting_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
         total: How often.
 
     Yields:
-        What to call with how often it was done.
+        What to call with how often it was done, and with the total where that has become known.
     """
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(what, total=total)
-        yield lambda done: progress.update(task, completed=done)
+        yield lambda done, total=None: progress.update(task, completed=done, total=total)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli.hand_scene import HandScene
-from jaxgrasp.cli.problems import CommandError, check_options
+from jaxgrasp.cli.problems import CommandError, Skipped, check_options
 from jaxgrasp.cli.streams import one_line
 from jaxgrasp.storage import FileError, read_archive, read_array
 
@@ -39,8 +39,15 @@ class GivenScene(HandScene):
     """With --hand: of the object's lengths; None is the grasps' own obj_scale, or 1."""
 
     grasps: tuple[Path, ...] = ()
-    """With --hand: files of grasps, .npz: grasp_qpos (N, 7 + n), pose of the base and joints, and where present
-    obj_pose (N, 7), obj_scale (N,) and joint_names; other columns travel along."""
+    """With --hand: files, folders and patterns of grasps in any format of docs/grasp_files.md; our own is .npz with
+    grasp_qpos (N, 7 + n), pose of the base and joints, and where present obj_pose (N, 7), obj_scale (N,) and
+    joint_names; other columns travel along."""
+
+    grasp_format: str | None = None
+    """The format of --grasps; None looks at the content of each file. A wrong name is answered with all names."""
+
+    keep_going: bool = False
+    """With --grasps: pass over files that cannot be used, with a line for each; the exit code is 2 then."""
 
     qpos: Path | None = None
     """With --scene: configurations, .npy (N, nq), or .npz with the field qpos; other columns travel along."""
@@ -79,8 +86,15 @@ class GivenScene(HandScene):
             ("--max-penetration", self.max_penetration, self.max_penetration >= 0.0, "metres >= 0"),
         )
 
-    def candidates(self, friction: float | None, max_force: float | None) -> "tuple[Candidates, list[HandObject]]":
+    def candidates(
+        self, friction: float | None, max_force: float | None, skipped: Skipped | None = None
+    ) -> "tuple[Candidates, list[HandObject]]":
         """Reads or samples the configurations, finds their contacts and leaves out what the options say.
+
+        Args:
+            friction: Of every contact; None is the models'.
+            max_force: Of every contact, N.
+            skipped: Told of files that cannot be used, with --keep-going.
 
         Returns:
             The candidates, and the scenes that they are of: the column `scene` says which.
@@ -93,7 +107,7 @@ class GivenScene(HandScene):
         from jaxgrasp.ranking.configurations import candidates_of, kept, trimmed
 
         if self.hand:
-            found, hands = candidates_of_grasps(self, friction, max_force)
+            found, hands = candidates_of_grasps(self, friction, max_force, skipped if self.keep_going else None)
         else:
             hands = [self.hand_object(friction, max_force)]
             columns: dict[str, np.ndarray] = {}

@@ -1,15 +1,27 @@
 """The disk: the one writer and the one reader of the package, and the folder of what is kept between runs."""
 
-from jaxgrasp.storage.arrays import Archive, Header, open_archive, read_archive, read_array
+from jaxgrasp.storage.arrays import (
+    PICKLE_COST,
+    Archive,
+    Header,
+    array_of_bytes,
+    open_archive,
+    read_archive,
+    read_array,
+    read_members,
+    read_objects,
+)
 from jaxgrasp.storage.cache import cache_folder
 from jaxgrasp.storage.reading import FileError, allowance, limited_to, open_regular, printable, reason_of
 from jaxgrasp.storage.writing import atomic_write, check_writable, discard_unfinished, unfinished
 
 __all__ = [
+    "PICKLE_COST",
     "Archive",
     "FileError",
     "Header",
     "allowance",
+    "array_of_bytes",
     "atomic_write",
     "cache_folder",
     "check_writable",
@@ -20,6 +32,8 @@ __all__ = [
     "printable",
     "read_archive",
     "read_array",
+    "read_members",
+    "read_objects",
     "reason_of",
     "unfinished",
 ]

@@ -31,6 +31,8 @@ _MEMBERS, _DIRECTORY = 2_000, 4 << 20
 # Archives of zeros shrink a thousandfold; grasps, hardly at all. Small members, such as a constant column of a million
 # candidates, may shrink as they like.
 _INFLATION, _SMALL = 100, 256 << 20
+PICKLE_COST = 16
+"""Bytes of memory that a byte of a pickle, or of an archive with one, may come to take in other types and objects."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ class Archive:
                 stream.read(1)
         except _BROKEN as error:
             _damaged(self._path, name, error)
-        return _array(self._path, name, header, data)
+        return array_of_bytes(self._path, name, header, data)
 
     def _open(self, name: str, member: zipfile.ZipInfo) -> Any:
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -208,7 +210,54 @@ def read_array(path: Path | str) -> np.ndarray:
             raise FileError(path, None, f"{in_bytes(there)} of {in_bytes(header.size)} of data", wanted)
         stream.seek(header.offset)
         data = np.fromfile(stream, np.uint8, header.size)
-    return _array(path, None, header, data)
+    return array_of_bytes(path, None, header, data)
+
+
+def read_objects(path: Path | str) -> tuple[Header, bytes]:
+    """Reads an `.npy` file of Python objects as the bytes that it has; nothing of them is looked at.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The header and all bytes of the file, the pickle from `header.offset` on.
+
+    Raises:
+        FileError: The file is absent, unreadable, of another kind or too large.
+    """
+    path, wanted = Path(path), "an .npy file of numpy.save"
+    with open_regular(path, wanted, cost=PICKLE_COST) as stream:
+        content = stream.read()
+    if not content.startswith(_MAGIC):
+        raise FileError(path, None, "a file of another kind" if content else "an empty file", wanted)
+    return _parsed(path, None, content[: _HEADER + 12]), content
+
+
+def read_members(path: Path | str, wanted: str) -> dict[str, bytes]:
+    """Reads every member of a zip archive that is not compressed, as those of PyTorch are.
+
+    Args:
+        path: The file.
+        wanted: What the file should be, for the message.
+
+    Returns:
+        The members' bytes by name, together no more than the file has.
+
+    Raises:
+        FileError: The file is absent, unreadable, no archive, damaged, compressed or too large.
+    """
+    path = Path(path)
+    with open_regular(path, wanted, cost=PICKLE_COST) as stream:
+        try:
+            size = stream.seek(0, io.SEEK_END)
+            with zipfile.ZipFile(_Bounded(stream)) as archive:  # type: ignore[arg-type]
+                members = archive.infolist()
+                plain = all(m.compress_type == zipfile.ZIP_STORED and m.file_size == m.compress_size for m in members)
+                if not plain or sum(m.file_size for m in members) > size or len(members) > _MEMBERS:
+                    raise FileError(path, None, "members that are compressed, overlap or are too many", wanted)
+                return {member.filename: archive.read(member) for member in members}
+        except _BROKEN as error:
+            _damaged(path, None, error, wanted)
 
 
 class _Bounded:
@@ -265,12 +314,22 @@ def _check_cost(path: Path, name: str | None, cost: int) -> None:
         raise FileError(path, name, f"arrays that take {in_bytes(cost)} in memory", limit)
 
 
-def _array(path: Path, name: str | None, header: Header, data: np.ndarray) -> np.ndarray:
-    """The array of these bytes."""
+def array_of_bytes(path: Path | str, name: str | None, header: Header, data: np.ndarray) -> np.ndarray:
+    """The array that bytes are the data of.
+
+    Args:
+        path: The file, for messages.
+        name: The array in it.
+        header: What the array is.
+        data: As many bytes as it has.
+
+    Raises:
+        FileError: Text is no Unicode.
+    """
     array = np.ndarray(header.shape[::-1] if header.fortran_order else header.shape, header.dtype, data)
     if array.dtype.kind == "b":
         # Truth values may be written as any byte; arithmetic knows 0 and 1.
-        array = data.reshape(array.shape) != 0
+        array = np.asarray(data.reshape(array.shape) != 0)
     if array.dtype.kind == "U" and array.size and array.dtype.itemsize:
         codes = data.view(array.dtype.byteorder.replace("|", "=") + "u4")
         if codes.max() > 0xD7FF and (((codes > 0xD7FF) & (codes < 0xE000)) | (codes > 0x10FFFF)).any():
@@ -278,7 +337,7 @@ def _array(path: Path, name: str | None, header: Header, data: np.ndarray) -> np
     return array.T if header.fortran_order else array
 
 
-def _damaged(path: Path, name: str | None, error: Exception) -> NoReturn:
+def _damaged(path: Path, name: str | None, error: Exception, wanted: str = "an intact .npz file") -> NoReturn:
     if isinstance(error, FileError):
         raise error
-    raise FileError(path, name, f"damaged data ({reason_of(error)})", "an intact .npz file") from error
+    raise FileError(path, name, f"damaged data ({reason_of(error)})", wanted) from error

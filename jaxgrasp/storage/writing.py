@@ -23,13 +23,15 @@ _unfinished: set[Path] = set()
 
 
 @contextlib.contextmanager
-def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
+def atomic_write(path: Path | str, *, more_follow: bool = False) -> Iterator[BinaryIO]:
     """Opens a file for writing that replaces an older one at the end of the block, or, after an error, does not.
 
     A symbolic link stays, and the file that it points to is replaced. The older file's permissions are kept.
 
     Args:
         path: The file.
+        more_follow: Whether other files for the same folder follow: what is done once for the folder (removing what
+            dead processes have left, and bringing the new names to the disk) is left to the last of them.
 
     Yields:
         A stream of bytes.
@@ -38,7 +40,8 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
         OSError: The file cannot be written; an older one is as it was.
     """
     target = _target(path)
-    _sweep(target.parent)
+    if not more_follow:
+        _sweep(target.parent)
     part, descriptor = _begin(target.parent)
     try:
         with contextlib.suppress(OSError):
@@ -53,7 +56,8 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
             part.unlink()
         os.close(descriptor)
         _unfinished.discard(part)
-    _make_lasting(target.parent)
+    if not more_follow:
+        _make_lasting(target.parent)
 
 
 def check_writable(path: Path | str) -> None:

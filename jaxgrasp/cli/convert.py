@@ -1,0 +1,141 @@
+"""`jaxgrasp convert`: grasps of any format that is read, in one that is written."""
+
+import math
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from jaxgrasp.cli import signals
+from jaxgrasp.cli.problems import CommandError, Skipped, check_options
+from jaxgrasp.cli.setting import Reading
+from jaxgrasp.cli.streams import one_line, printing
+from jaxgrasp.storage import check_writable, reason_of
+
+_FILES = {"jaxgrasp": (".npz",), "isaac_grasp": (".yaml", ".yml")}
+_FOLDERS = ("dexgraspbench", "isaac_grasp")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(Reading):
+    """Read grasps in any format and write them in another one.
+
+    What files of docs/grasp_files.md say of joints, bases, objects, scales and stages comes along; what the other
+    format has no word for is told in one line. Numbers are the same to float32 at least.
+    """
+
+    grasps: tyro.conf.Positional[tuple[Path, ...]]
+    """Files, folders and patterns of grasps."""
+
+    to: str
+    """jaxgrasp (a file .npz), dexgraspbench (a folder with a file for each grasp), or isaac_grasp (a file .yaml, or a
+    folder with one for each object and scale)."""
+
+    output: Path
+    """The file, or the new or empty folder, to write."""
+
+    format: str | None = None
+    """The format of the grasps; None looks at the content of each file. A wrong name is answered with all names."""
+
+    hand: str | None = None
+    """The hand: an MJCF or URDF file, or a name as for rank. It says where links stand that files give poses of, and
+    the names and the order of joints."""
+
+    object: str | None = None
+    """What the object is called in the files written; None is what the files say."""
+
+    scale: float | None = None
+    """Of the object's lengths; None is what the files say."""
+
+    keep_going: bool = False
+    """Pass over files that cannot be used, with a line for each; the exit code is 2 then."""
+
+    def run(self) -> int:
+        """Reads, writes and prints.
+
+        Returns:
+            The exit code: 0, 130 after Ctrl-C, 2 where a file was passed over.
+
+        Raises:
+            CommandError: The options or a file cannot be used, or the output cannot be written.
+        """
+        from jaxgrasp.cli.hand_grasps import grasps_of_files
+        from jaxgrasp.cli.report import counting_bar
+        from jaxgrasp.files import write_grasps
+
+        self._check()
+        skipped = Skipped()
+        grasps = grasps_of_files(
+            self.grasps,
+            self.format,
+            hand=self.hand,
+            scale=self.scale,
+            skipped=skipped if self.keep_going else None,
+            option="--format",
+        )
+        if self.object is not None:
+            grasps = replace(grasps, object_name=np.full(len(grasps), self.object))
+        done = 0
+        try:
+            with counting_bar("writing grasps", len(grasps)) as progress:
+
+                def show(count: int) -> None:
+                    nonlocal done
+                    done = count
+                    progress(count)
+                    if count < len(grasps):
+                        signals.checkpoint()
+
+                lost = write_grasps(grasps, self.output, self.to, hand=self.hand, progress=show)
+        except KeyboardInterrupt:
+            one_line(f"{signals.word()}: wrote {done:,} of {len(grasps):,} grasps to {self.output}")
+            return 130
+        except ValueError as error:
+            text = str(error)
+            raise CommandError(f"--{text}" if text.startswith("hand: ") else text) from error
+        except OSError as error:
+            raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
+        signals.note_written(self.output)
+        if lost:
+            one_line(f"{self.to} cannot say: {'; '.join(lost)}")
+        with printing():
+            print(f"written: {self.output} ({len(grasps):,} grasps)")
+        return skipped.exit_code()
+
+    def _check(self) -> None:
+        from jaxgrasp.files import WRITTEN
+
+        plain = self.to.lower().replace("-", "_")
+        check_options(
+            ("--to", self.to, plain in WRITTEN, f"one of {', '.join(WRITTEN)}"),
+            ("--scale", self.scale, self.scale is None or 0.0 < self.scale < math.inf, "a number > 0"),
+        )
+        if not self.grasps:
+            raise CommandError("convert: got no files; wanted grasps to convert")
+        endings = _FILES.get(plain, ())
+        if self.output.suffix in endings:
+            if any(os.path.realpath(self.output) == os.path.realpath(path) for path in self.grasps):
+                raise CommandError(f"--output {self.output}: this file is read from; wanted another one")
+            self._check_writable(self.output)
+        elif plain in _FOLDERS:
+            self._check_folder()
+        else:
+            got = f"the ending {self.output.suffix!r}"
+            raise CommandError(f"--output {self.output}: got {got}; wanted {' or '.join(endings)}")
+
+    def _check_folder(self) -> None:
+        try:
+            if self.output.is_dir() and any(self.output.iterdir()):
+                raise CommandError(f"--output {self.output}: got a folder with files in it; wanted a new or empty one")
+            self.output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
+        self._check_writable(self.output / "0.npy")
+
+    def _check_writable(self, path: Path) -> None:
+        try:
+            check_writable(path)
+        except (OSError, ValueError) as error:
+            raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
