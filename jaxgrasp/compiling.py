@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from jaxgrasp import process
 
@@ -53,7 +54,7 @@ def compiled(
         process.check()
         with own_settings():
             # Inside somebody's jit every operation gives a tracer, even one on constants.
-            traced = any(isinstance(x, jax.core.Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(args)))
+            traced = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(args)))
             if traced:
                 return inner(*args)
             # NaN and infinity are answers here.

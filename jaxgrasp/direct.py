@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 Tree = Any
 
@@ -19,8 +20,8 @@ def is_direct(leaves: Iterable[Any]) -> bool:
     if jax.default_backend() != "cpu" or not jax.sharding.get_abstract_mesh().empty:
         return False
     # Inside somebody's jit every operation gives a tracer, even one on constants.
-    known = all(isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer) and not x.committed for x in leaves)
-    return known and not isinstance(jnp.zeros(()), jax.core.Tracer)
+    known = all(isinstance(x, jax.Array) and not isinstance(x, Tracer) and not x.committed for x in leaves)
+    return known and not isinstance(jnp.zeros(()), Tracer)
 
 
 def power_of_two(count: int, least: int) -> int:

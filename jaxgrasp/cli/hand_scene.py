@@ -11,8 +11,6 @@ from jaxgrasp.cli.problems import CommandError, check_options
 from jaxgrasp.cli.streams import one_line
 
 if TYPE_CHECKING:
-    import mujoco
-
     from jaxgrasp import hands
     from jaxgrasp.hands import HandObject
 
@@ -24,7 +22,7 @@ _SAID: set[str] = set()
 
 
 @functools.cache
-def _read_hand(name: str) -> "mujoco.MjSpec":
+def _read_hand(name: str) -> Any:
     """The specification of a hand, read once for the scenes of all scales."""
     from jaxgrasp.hands.hand_files import read_spec
     from jaxgrasp.hands.hand_names import hand_file

@@ -1,8 +1,8 @@
 """What the joints and actuators of a hand transmit to its contacts."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -67,7 +67,7 @@ class Actuation:
             lower=lower.shape[:-1],
             upper=upper.shape[:-1],
         )
-        if given.ndim == 2 and not isinstance(transmission, jax.core.Tracer):
+        if given.ndim == 2 and not isinstance(transmission, Tracer):
             # What is not finite makes every grasp inadmissible, here it only must not stop the decomposition.
             known = np.nan_to_num(np.asarray(transmission, np.float64), posinf=0, neginf=0)
             left, values, right = np.linalg.svd(known)

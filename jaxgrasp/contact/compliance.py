@@ -121,7 +121,7 @@ def row_basis(rows: jax.Array) -> Basis:
 
     @fenced
     def correct(factor: jax.Array, rows: jax.Array, operations: jax.Array) -> tuple:
-        apply = lambda f: (  # noqa: E731
+        apply = lambda f: (
             fold(jnp.add, [f_r * r for f_r, r in zip(f, rows, strict=True)]),
             fold(jnp.add, [f_r * o for f_r, o in zip(f, operations, strict=True)]),
         )
@@ -195,7 +195,7 @@ def _whitened_jvp(primals: tuple, tangents: tuple) -> tuple[Basis, Basis]:
 @fenced
 def _operate(basis: Basis, rows: jax.Array) -> jax.Array:
     """T rows, zero where dropped."""
-    combine = lambda t: fold(jnp.add, [t_r * r for t_r, r in zip(t[0], rows, strict=True)]) * t[1]  # noqa: E731
+    combine = lambda t: fold(jnp.add, [t_r * r for t_r, r in zip(t[0], rows, strict=True)]) * t[1]
     return each(combine, (basis.operations, basis.kept))
 
 
@@ -207,7 +207,7 @@ def _inverse(rows: jax.Array) -> tuple[jax.Array, Basis]:
     @fenced
     def assemble(rows: jax.Array, operations: jax.Array) -> jax.Array:
         # On dropped rows the basis is zero, so what T holds there does not matter.
-        column = lambda t: fold(jnp.add, [r * t_r for r, t_r in zip(rows, t, strict=True)])  # noqa: E731
+        column = lambda t: fold(jnp.add, [r * t_r for r, t_r in zip(rows, t, strict=True)])
         return jnp.moveaxis(each(column, jnp.moveaxis(operations, 1, 0)), 0, 1)
 
     return assemble(basis.rows, basis.operations), basis
@@ -230,7 +230,7 @@ def _inverse_jvp(primals: tuple, tangents: tuple) -> tuple:
     @fenced
     def assemble(inverse: jax.Array, turned: jax.Array, both: jax.Array) -> jax.Array:
         columns = jnp.swapaxes(inverse, 0, 1)
-        column = lambda v: v[0] - fold(jnp.add, [c * b for c, b in zip(columns, v[1], strict=True)])  # noqa: E731
+        column = lambda v: v[0] - fold(jnp.add, [c * b for c, b in zip(columns, v[1], strict=True)])
         return jnp.swapaxes(each(column, (turned, both)), 0, 1)
 
     still = jax.tree.map(jnp.zeros_like, basis)
@@ -281,9 +281,7 @@ def pseudo_inverse_adjoint(
     def combine(cross: jax.Array, gram: jax.Array, rows: jax.Array, inverse: jax.Array, own: jax.Array) -> jax.Array:
         left = jnp.swapaxes(cross, 0, 1)
         rest = own - each(lambda x: fold(jnp.add, [r * x_r for r, x_r in zip(rows, x, strict=True)]), left)
-        pair = lambda k: fold(  # noqa: E731
-            jnp.add, [v * k_r - i * x_r for v, i, k_r, x_r in zip(rest, inverse, *k, strict=True)]
-        )
+        pair = lambda k: fold(jnp.add, [v * k_r - i * x_r for v, i, k_r, x_r in zip(rest, inverse, *k, strict=True)])
         return each(pair, (gram, cross))
 
     back = combine(*products(inverse, own), rows, inverse, own)

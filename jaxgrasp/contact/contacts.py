@@ -178,7 +178,7 @@ def rotations(frames: jax.Array) -> jax.Array:
     tolerance = 1e-6 if frames.dtype == jnp.float64 else 1e-4
     t1, t2, normal = ([frames[:, r, a] for r in range(3)] for a in range(3))
     cross = [t1[1] * t2[2] - t1[2] * t2[1], t1[2] * t2[0] - t1[0] * t2[2], t1[0] * t2[1] - t1[1] * t2[0]]
-    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # noqa: E731
-    near = lambda x, y: jnp.abs(x - y) <= tolerance  # noqa: E731
+    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    near = lambda x, y: jnp.abs(x - y) <= tolerance
     aligned = near(cross[0], normal[0]) & near(cross[1], normal[1]) & near(cross[2], normal[2])
     return near(dot(t1, t1), 1) & near(dot(t2, t2), 1) & near(dot(t1, t2), 0) & aligned

@@ -77,7 +77,7 @@ def required_wrench(
     given = [getattr(x, "dtype", int) for x in (mass, gravity, inertia, twist, acceleration)]
     given = [dtype for dtype in given if jnp.issubdtype(dtype, jnp.floating)]
     dtype = functools.reduce(jnp.promote_types, given) if given else jnp.result_type(float)
-    array = lambda name, x, event: as_float(name, np.zeros(event) if x is None else x, event).astype(dtype)  # noqa: E731
+    array = lambda name, x, event: as_float(name, np.zeros(event) if x is None else x, event).astype(dtype)
     m = array("mass", mass, ())
     g = array("gravity", gravity, (3,))
     body = array("inertia", inertia, (3, 3))
@@ -91,7 +91,7 @@ def required_wrench(
         acceleration=rate.shape[:-1],
     )
     v, w = velocity[..., :3], velocity[..., 3:]
-    turn = lambda x: jnp.einsum("...ij,...j->...i", body, x)  # noqa: E731
+    turn = lambda x: jnp.einsum("...ij,...j->...i", body, x)
     force = m[..., None] * (rate[..., :3] - g + jnp.cross(w, v))
     moment = turn(rate[..., 3:]) + jnp.cross(w, turn(w))
     return jnp.concatenate([jnp.broadcast_to(force, (*batch, 3)), jnp.broadcast_to(moment, (*batch, 3))], -1)

@@ -148,7 +148,7 @@ class DisturbanceSet:
         batch = broadcast_batch(directions=directions.shape[:-2], disturbances=self.batch_shape)
         rows = jnp.broadcast_to(directions, (*batch, *directions.shape[-2:]))
         lead = len(batch)
-        to_last = lambda x: jnp.moveaxis(x, tuple(range(lead)), tuple(range(-lead, 0))) if lead else x  # noqa: E731
+        to_last = lambda x: jnp.moveaxis(x, tuple(range(lead)), tuple(range(-lead, 0))) if lead else x
         terms = jax.tree.map(to_last, self.spread_over(batch)).terms
         value = support(terms, jnp.moveaxis(to_last(rows), 1, 0))
         return jnp.moveaxis(value, tuple(range(-lead, 0)), tuple(range(lead))) if lead else value

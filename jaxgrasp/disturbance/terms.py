@@ -9,8 +9,8 @@ With a width w > 0 (N) the support functions are smooth and by some w larger: lo
 maximum over vertices and the origin, sqrt(x^2 + w^2) in place of |x|.
 """
 
-from dataclasses import replace
-from typing import Protocol, Self
+from dataclasses import Field, replace
+from typing import Any, ClassVar, Protocol, Self
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,14 @@ from jaxgrasp.records import record
 
 
 class Term(Protocol):
-    """A convex set of wrenches that contains the origin."""
+    """A convex set of wrenches that contains the origin: a record with a width that smooths it, None for none."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def width(self) -> jax.Array | None:
+        """(*batch,), N, see above."""
+        ...
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -227,7 +234,8 @@ class Ball:
 
     def support(self, directions: jax.Array) -> jax.Array:
         """Force |a_f| + torque |a_m|."""
-        return sum(_length(half, self.width) for half in self._scaled(directions))
+        halves = self._scaled(directions)
+        return sum(_length(half, self.width) for half in halves)  # pyright: ignore[reportReturnType]  # no sum of none
 
     def furthest(self, directions: jax.Array) -> jax.Array:
         """Radii times unit vectors."""

@@ -13,7 +13,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.disturbance.terms import align, checked, combine, common, spread
+from jaxgrasp.disturbance.terms import Term, align, checked, combine, common, spread
 from jaxgrasp.fence import fenced
 from jaxgrasp.records import record
 
@@ -64,6 +64,13 @@ class Vertices:
         largest = jnp.max(jnp.abs(self.wrenches), -2, initial=0)
         # XLA's CPU code for the maximum of many lanes was seen to pass over NaN.
         return checked(jnp.where(jnp.isnan(self.wrenches).any(-2), jnp.nan, largest), self.width)
+
+
+def wrenches_of(terms: tuple[Term, ...]) -> jax.Array:
+    """The wrenches of a set that is one list of vertices; callers have seen to that."""
+    (first, *_) = terms
+    assert isinstance(first, Vertices)
+    return first.wrenches
 
 
 def _over_vertices(vertices: Tree, row: jax.Array, raise_to: Callable, best: Tree) -> Tree:

@@ -1,6 +1,7 @@
 """Shapes made of others: smooth unions, and shapes that are moved and turned."""
 
 import itertools
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,7 +71,11 @@ class Placed(Shape):
 
     @classmethod
     def from_pose(
-        cls, shape: Shape, *, translation: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
+        cls,
+        shape: Shape,
+        *,
+        translation: ArrayLike | Sequence[float] = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | None = None,
     ) -> "Placed":
         """A shape at a pose in the object's frame.
 

@@ -137,7 +137,7 @@ class Mesh:
 
         The counts are odd.
         """
-        indices = np.indices(counts)
+        indices = np.indices(tuple(counts))
         even = (indices % 2 == 0).all(0)
 
         def exact(where: np.ndarray) -> np.ndarray:

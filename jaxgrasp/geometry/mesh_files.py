@@ -25,7 +25,9 @@ _CORNER = re.compile(rb"^\s*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILI
 _LAST_LINE = re.compile(rb"^\s*endsolid\b[^\n]*\s*\Z", re.MULTILINE | re.IGNORECASE)
 _FACETS = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-_TYPES = dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), _KINDS, strict=True))
+_TYPES: dict[str, str] = dict(
+    zip(("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), _KINDS, strict=True)
+)
 _TYPES |= dict(zip(("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"), _KINDS, strict=True))
 
 
@@ -135,7 +137,7 @@ class _Property(NamedTuple):
 
 class _Element(NamedTuple):
     name: str
-    count: int
+    rows: int
     properties: list[_Property]
 
 
@@ -144,7 +146,7 @@ def _ply(content: bytes) -> _Polygons:
     if not end or not re.match(rb"ply\s", content):
         raise ValueError("no header, or one that does not end")
     order, elements = _declared(content[: end.start()].decode("latin-1"))
-    if sum(element.count for element in elements) > len(content):
+    if sum(element.rows for element in elements) > len(content):
         raise ValueError("more elements than bytes")
     data, at, found = memoryview(content)[end.end() :], 0, {}
     if order is None:
@@ -169,7 +171,7 @@ def _numbers(text: bytes) -> memoryview:
     _check_lines(text)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return memoryview(np.fromstring(text, sep=" ")).cast("B")
+        return np.fromstring(text, sep=" ").data.cast("B")
 
 
 def _columns(
@@ -180,7 +182,7 @@ def _columns(
     where = at
     for name, kind, length in element.properties:
         count = 1
-        if length and element.count:
+        if length and element.rows:
             count = int(np.frombuffer(data, order + length, 1, where)[0])
             where += np.dtype(length).itemsize
             lengths.append((f"number of {name}", count))
@@ -190,14 +192,14 @@ def _columns(
         row.append((name, order + kind, (count,)))
         where += count * np.dtype(kind).itemsize
     kinds = np.dtype(row)
-    if at + element.count * kinds.itemsize <= len(data):
-        table = np.frombuffer(data, kinds, element.count, at)
+    if at + element.rows * kinds.itemsize <= len(data):
+        table = np.frombuffer(data, kinds, element.rows, at)
         if all((table[name] == count).all() for name, count in lengths):
             columns = {
-                p.name: (table[p.name].reshape(-1), np.full(element.count, table[p.name].shape[1]))
+                p.name: (table[p.name].reshape(-1), np.full(element.rows, table[p.name].shape[1]))
                 for p in element.properties
             }
-            return columns, at + element.count * kinds.itemsize
+            return columns, at + element.rows * kinds.itemsize
     return _uneven(data, at, element, order)
 
 
@@ -210,7 +212,7 @@ def _uneven(
     sizes = [np.dtype(p.kind).itemsize for p in element.properties]
     lengths = [struct.Struct(order + np.dtype(p.length).char) if p.length else None for p in element.properties]
     steps = list(zip([p.name for p in element.properties], sizes, lengths, strict=True))
-    for _ in range(element.count):
+    for _ in range(element.rows):
         for name, size, length in steps:
             if length is None:
                 at += size

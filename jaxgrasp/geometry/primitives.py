@@ -1,5 +1,7 @@
 """Spheres, ellipsoids, boxes, capsules, cylinders and superquadrics about the origin of the object's frame."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -45,7 +47,9 @@ class Superquadric(Shape):
     """p, of the outlines through the z axis, and q, of the outline across it; 2 is round, larger is boxier."""
 
     @classmethod
-    def from_semi_axes(cls, semi_axes: ArrayLike, exponents: ArrayLike = (4.0, 4.0)) -> "Superquadric":
+    def from_semi_axes(
+        cls, semi_axes: ArrayLike, exponents: ArrayLike | Sequence[float] = (4.0, 4.0)
+    ) -> "Superquadric":
         """A superquadric.
 
         Args:

@@ -1,6 +1,7 @@
 """What every shape answers."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -31,7 +32,7 @@ class Shape(ABC):
         """Lower and upper corner of a box along the axes that holds the shape, m."""
 
 
-def size(name: str, value: ArrayLike, event: tuple[int, ...], *, zero: bool = False) -> Array:
+def size(name: str, value: ArrayLike | Sequence[float], event: tuple[int, ...], *, zero: bool = False) -> Array:
     """A length or lengths, checked.
 
     Args:

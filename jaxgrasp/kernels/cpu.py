@@ -160,7 +160,7 @@ def _unpacking(program: Program, code: VectorCode, results: list[tuple[str, int,
     code.enter(part)
     valid = code.emit(f"sub i64 {rows}, {first}")
     for number, (place, count, kind) in zip(pointers, results, strict=True):
-        row_of = lambda lane: code.emit(f"add i64 {first}, {lane}")  # noqa: E731
+        row_of = lambda lane: code.emit(f"add i64 {first}, {lane}")
         _unpack_some(code, place, _pointer(code, number), row_of, valid, count, kind)
     code.do(f"br label %{done}")
     code.enter(done)
@@ -169,7 +169,7 @@ def _unpacking(program: Program, code: VectorCode, results: list[tuple[str, int,
         return
     code.begin("void @unpack_rows(ptr noalias %state, ptr noalias %rows, i64 %valid, ptr noalias %frame)")
     for number, (place, count, kind) in zip(pointers, results, strict=True):
-        row_of = lambda lane: code.emit(f"load i64, ptr {code.entry('%rows', 'i64', lane)}")  # noqa: E731
+        row_of = lambda lane: code.emit(f"load i64, ptr {code.entry('%rows', 'i64', lane)}")
         _unpack_some(code, place, _pointer(code, number), row_of, "%valid", count, kind)
     code.do("ret void")
 

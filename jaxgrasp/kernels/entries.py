@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import ShapedArray
 
 from jaxgrasp.kernels.expressions import Value, kind_of
 
@@ -30,6 +31,14 @@ def known(x: np.ndarray, dtype: Any) -> np.ndarray:
 def kind_of_scalar(v: Any) -> str:
     """The type of one scalar."""
     return v.kind if type(v) is Value else kind_of(v.dtype)
+
+
+def aval_of(variable: Any) -> ShapedArray:
+    """Shape and type of a variable, or of a constant in its place: kernels are of arrays, and have no other variables.
+
+    JAX declares no more than that there is an abstract value.
+    """
+    return variable.aval
 
 
 def like(aval: Any, dtype: Any) -> Any:

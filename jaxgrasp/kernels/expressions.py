@@ -6,7 +6,7 @@ not change in a loop is computed before it.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -25,7 +25,14 @@ class Region:
         self.steps: list[Any] = []
         self.known: dict[tuple, Value] = {}
 
+    @property
+    def outer(self) -> "Region":
+        """The region around it, which all have but the kernel's own."""
+        assert self.parent is not None
+        return self.parent
 
+
+@final
 class Value:
     """A scalar that is computed: an operation, its operands, its type and its region.
 
@@ -145,15 +152,19 @@ class Builder:
             return (1 / np.sqrt(args[0])).astype(args[0].dtype)
         return _FOLD[op](*args)
 
-    def _simplified(self, op: str, args: tuple) -> Any:
+    def _simplified(self, op: str, args: tuple[Any, ...]) -> Any:
         """Cheaper forms; a product with zero is zero, whatever the other factor."""
         if op in ("add", "sub", "mul", "div"):
             a, b = args
             left, right = type(a) is not Value, type(b) is not Value
             if op == "mul":
                 for x, y, known in ((a, b, left), (b, a, right)):
-                    if known and x in (0, 1, -1):
-                        return x * x.dtype.type(0) if x == 0 else y if x == 1 else self.make("neg", y)
+                    if not known:
+                        continue
+                    number: np.generic = x
+                    if number in (0, 1, -1):
+                        zero = number.dtype.type(0)
+                        return x * zero if number == 0 else y if number == 1 else self.make("neg", y)
                 # Signs go outwards, where a sum takes them up.
                 for x, y in ((a, b), (b, a)):
                     if type(x) is Value and x.op == "neg":

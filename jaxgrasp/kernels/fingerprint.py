@@ -9,6 +9,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from jaxgrasp.kernels.entries import aval_of
+
 
 def of_origin(known_as: str, given: list[jax.ShapeDtypeStruct], shared: tuple[bool, ...], described: str) -> str:
     """The same for functions that are known by the same name and get the same arguments.
@@ -37,7 +39,7 @@ def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], described: str) -> 
 
     def name(v: Any) -> str:
         if isinstance(v, Literal):
-            return f"{v.val!r}:{v.aval.dtype}"
+            return f"{v.val!r}:{aval_of(v).dtype}"
         return str(numbers.setdefault(v, len(numbers)))
 
     def plain(value: Any) -> str:
@@ -59,12 +61,12 @@ def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], described: str) -> 
 
     def walk(inner: Jaxpr) -> None:
         for v in (*inner.constvars, *inner.invars):
-            digest.update(f"{name(v)}={v.aval.dtype}{v.aval.shape};".encode())
+            digest.update(f"{name(v)}={aval_of(v).dtype}{aval_of(v).shape};".encode())
         for eqn in inner.eqns:
             # What only matters to XLA, and may differ between traces of the same program.
             params = {k: v for k, v in eqn.params.items() if k not in _INCIDENTAL}
             said = [eqn.primitive.name, *map(name, eqn.invars), *[f"{k}={plain(v)}" for k, v in params.items()]]
-            outs = [f"{name(v)}={v.aval.dtype}{v.aval.shape}" for v in eqn.outvars]
+            outs = [f"{name(v)}={aval_of(v).dtype}{aval_of(v).shape}" for v in eqn.outvars]
             digest.update((" ".join([*said, *outs]) + "\n").encode())
         digest.update(("->" + ",".join(map(name, inner.outvars))).encode())
 

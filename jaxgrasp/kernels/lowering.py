@@ -9,11 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
 
-from jaxgrasp.kernels.entries import array, kinds_of, known, objects
+from jaxgrasp.kernels.entries import array, aval_of, kinds_of, known, objects
 from jaxgrasp.kernels.expressions import Builder, Region, Unsupported, Value, kind_of
 from jaxgrasp.kernels.rules import ELEMENTWISE, RULES
 
@@ -78,8 +77,8 @@ def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
     Raises:
         Unsupported: what fused kernels cannot do.
     """
-    floats = {np.dtype(v.aval.dtype) for v in jaxpr.jaxpr.outvars if kind_of(v.aval.dtype) == "f"}
-    floats |= {np.dtype(v.aval.dtype) for v in jaxpr.jaxpr.invars if kind_of(v.aval.dtype) == "f"}
+    floats = {np.dtype(aval_of(v).dtype) for v in jaxpr.jaxpr.outvars if kind_of(aval_of(v).dtype) == "f"}
+    floats |= {np.dtype(aval_of(v).dtype) for v in jaxpr.jaxpr.invars if kind_of(aval_of(v).dtype) == "f"}
     if len(floats) != 1 or not floats <= {np.dtype("float32"), np.dtype("float64")}:
         raise Unsupported(f"floating types {floats}")
     if _entries(jaxpr.jaxpr) > _MOST_ENTRIES:
@@ -87,7 +86,7 @@ def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
     lowering = _Lowering(Builder(floats.pop()))
     inputs = []
     for number, (var, is_shared) in enumerate(zip(jaxpr.jaxpr.invars, shared, strict=True)):
-        aval = var.aval
+        aval = aval_of(var)
         kind = kind_of(aval.dtype)
         loads = [
             lowering.builder.value("shared" if is_shared else "own", (number, (i, None, 0)), kind)
@@ -96,7 +95,7 @@ def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
         inputs.append(array(loads, aval.shape))
     consts = [np.asarray(c) for c in jaxpr.consts]
     outputs = lowering.run(jaxpr.jaxpr, consts, inputs)
-    avals = lambda vs: [(tuple(v.aval.shape), np.dtype(v.aval.dtype)) for v in vs]  # noqa: E731
+    avals = lambda vs: [(tuple(aval_of(v).shape), np.dtype(aval_of(v).dtype)) for v in vs]
     return Program(lowering.builder, avals(jaxpr.jaxpr.invars), shared, outputs, avals(jaxpr.jaxpr.outvars))
 
 
@@ -104,7 +103,7 @@ def _entries(jaxpr: Jaxpr) -> int:
     """Of all arrays that are computed, in loops once for each round that may be spelt out."""
     total = 0
     for eqn in jaxpr.eqns:
-        total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
+        total += sum(math.prod(aval_of(v).shape) for v in eqn.outvars)
         length = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
         inner = sum(_entries(j) for j in jaxprs_in_params(eqn.params))
         total += inner * (length if length <= _STACKED else 1)
@@ -120,12 +119,12 @@ class _Lowering:
         bound = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(zip(jaxpr.invars, args, strict=True))
 
         def read(v: Any) -> np.ndarray:
-            return np.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else bound[v]
+            return np.asarray(v.val, aval_of(v).dtype) if isinstance(v, Literal) else bound[v]
 
         for eqn in jaxpr.eqns:
             outs = self.equation(eqn, [read(v) for v in eqn.invars])
             for var, out in zip(eqn.outvars, outs, strict=True):
-                assert out.shape == tuple(var.aval.shape), (eqn, out.shape)
+                assert out.shape == tuple(aval_of(var).shape), (eqn, out.shape)
                 bound[var] = out
         return [read(v) for v in jaxpr.outvars]
 
@@ -134,7 +133,7 @@ class _Lowering:
         name, params = eqn.primitive.name, eqn.params
         if name in _CALLS:
             inner = params[_CALLS[name]]
-            inner = inner if isinstance(inner, ClosedJaxpr) else jax.extend.core.ClosedJaxpr(inner, ())
+            inner = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
             return self.run(inner.jaxpr, [np.asarray(c) for c in inner.consts], args)
         if name in _CONTROL:
             return getattr(self, _CONTROL[name])(params, args)
@@ -202,7 +201,7 @@ class _Lowering:
         rows_now = [self.entry(x, counter) for x in xs]
         out = self.run(body.jaxpr, inner, [*consts, *start, *rows_now])
         results = iter(self.close_loop(loop, [x for i, x in enumerate(out) if i not in counters], inits))
-        last = lambda i: np.asarray(base[i] + length, base[i].dtype)  # noqa: E731
+        last = lambda i: np.asarray(base[i] + length, base[i].dtype)
         return [last(i) if i in counters else next(results) for i in range(n_carry)]
 
     def stack(self, rows: list[np.ndarray]) -> np.ndarray:
@@ -229,7 +228,7 @@ class _Lowering:
     def close_loop(self, loop: Loop, outputs: list[np.ndarray], like: list[np.ndarray]) -> list[np.ndarray]:
         """The loop is written; what it leaves."""
         loop.outputs = [v for x in outputs for v in objects(x).ravel()]
-        region = self.builder.region = loop.body.parent
+        region = self.builder.region = loop.body.outer
         region.steps.append(loop)
         loop.results = [Value("result", (loop, i), kind, region) for i, kind in enumerate(loop.kinds)]
         results = iter(loop.results)
@@ -256,7 +255,7 @@ class _Lowering:
         index, *operands = args
         branches = params["branches"]
         index = index.item()
-        results = None
+        results: list[np.ndarray] | None = None
         for number, branch in enumerate(branches):
             consts = [np.asarray(c) for c in branch.consts]
             if type(index) is not Value:
@@ -269,7 +268,7 @@ class _Lowering:
             guard = Guard(Region(self.builder.region, guarded=True), taken)
             self.builder.region = guard.body
             out = self.run(branch.jaxpr, consts, operands)
-            outer = self.builder.region = guard.body.parent
+            outer = self.builder.region = guard.body.outer
             flat = [v for x in out for v in objects(x).ravel()]
             local = [v for v in flat if type(v) is Value and v.region.depth > outer.depth]
             fresh = {v: Value("result", (guard, i), v.kind, outer) for i, v in enumerate(dict.fromkeys(local))}
@@ -280,6 +279,7 @@ class _Lowering:
                 array([fresh.get(v, v) if type(v) is Value else v for v in objects(x).ravel()], x.shape) for x in out
             ]
             results = out if results is None else self.choose(taken, out, results)
+        assert results is not None
         return results
 
     def linear_solve(self, params: dict, args: list[np.ndarray]) -> list[np.ndarray]:
@@ -335,7 +335,8 @@ def _counters(body: Jaxpr, n_consts: int, n_carry: int, carry: list[np.ndarray])
     found = {}
     for i in range(n_carry):
         var, out = body.invars[n_consts + i], body.outvars[i]
-        if var.aval.shape != () or kind_of(var.aval.dtype) != "i" or carry[i].dtype == object:
+        aval = aval_of(var)
+        if aval.shape != () or kind_of(aval.dtype) != "i" or carry[i].dtype == object:
             continue
         users = [e for e in body.eqns if any(v is var for v in e.invars)]
         raising = [e for e in users if e.primitive.name == "add" and e.outvars[0] is out and _is_one(e.invars)]

@@ -18,6 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import mlir, xla
 
@@ -91,8 +92,8 @@ def fused(
     given = [jax.ShapeDtypeStruct((*e, 1), x.dtype) for e, x in zip(events, leaves, strict=True)]
     plan = _planned(function, given, shared, known_as, platform)
     wanted, structure = jax.tree.flatten(plan.out)
-    shapes = tuple(jax.core.ShapedArray((problems, *x.shape[:-1]), x.dtype) for x in wanted)
-    flat = lambda *leaves: jax.tree.leaves(otherwise(list(leaves)))  # noqa: E731
+    shapes = tuple(ShapedArray((problems, *x.shape[:-1]), x.dtype) for x in wanted)
+    flat = lambda *leaves: jax.tree.leaves(otherwise(list(leaves)))
     return jax.tree.unflatten(structure, _fused_p.bind(*leaves, plan=plan, shapes=shapes, otherwise=flat))
 
 

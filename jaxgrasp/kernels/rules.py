@@ -173,7 +173,7 @@ def _dot(lower: Any, params: dict, aval: Any, a: np.ndarray, b: np.ndarray) -> n
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*contract_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*contract_b, *batch_b)]
-    size = lambda x, axes: math.prod(x.shape[i] for i in axes)  # noqa: E731
+    size = lambda x, axes: math.prod(x.shape[i] for i in axes)
     left = objects(a).transpose(*batch_a, *free_a, *contract_a)
     left = left.reshape(size(a, batch_a), size(a, free_a), size(a, contract_a))
     right = objects(b).transpose(*batch_b, *free_b, *contract_b)

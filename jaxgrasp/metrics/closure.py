@@ -137,7 +137,7 @@ def _decomposed(edges: Edges) -> tuple[jax.Array, jax.Array]:
     """Left singular vectors and singular values of the wrenches."""
     # Derivatives do not go through them: whether edges span the space does not change by little.
     W = jax.lax.stop_gradient(edges.flat)
-    return jnp.linalg.svd(jnp.swapaxes(W, -1, -2), full_matrices=False)[:2]
+    return jnp.linalg.svd(jnp.swapaxes(W, -1, -2), full_matrices=False, compute_uv=True)[:2]
 
 
 def _spans(edges: Edges, singular: jax.Array) -> jax.Array:

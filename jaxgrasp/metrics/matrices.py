@@ -86,6 +86,6 @@ def _extreme(blocks: jax.Array) -> tuple[jax.Array, jax.Array]:
     # The derivative of a singular value is that of |G'u| with its own u held.
     held = lax.stop_gradient(G)
     u = jnp.linalg.eigh(held @ jnp.swapaxes(held, -1, -2))[1]
-    length = lambda column: safe_norm(jnp.einsum("...ij,...i->...j", G, column))  # noqa: E731
+    length = lambda column: safe_norm(jnp.einsum("...ij,...i->...j", G, column))
     smallest, largest = length(u[..., 0]), length(u[..., -1])
     return jnp.where(smallest > RANK_TOLERANCE[G.dtype.name] * largest, smallest, 0), largest

@@ -105,7 +105,7 @@ def _predict(
         for start in range(0, resamples, _AT_ONCE)
     ]
     areas = np.array([np.concatenate([_areas(v, success, labels, w) for w in drawn]) for v in values])
-    limits = lambda x: np.nanquantile(x, [0.025, 0.975], axis=1).T  # noqa: E731
+    limits = lambda x: np.nanquantile(x, [0.025, 0.975], axis=1).T
     return Prediction(
         success=success,
         auc=whole,

@@ -107,6 +107,7 @@ def _columns(hand: HandObject, qpos: np.ndarray, limited: bool, engine: str | No
     columns = {name: getattr(grasps.contacts, name) for name in _CONTACTS}
     columns |= {name: getattr(grasps, name) for name in ("touching", "left_out", "penetration", "required_wrench")}
     if limited and grasps.actuation is not None:
+        assert grasps.spring_efforts is not None
         actuation = {f.name: getattr(grasps.actuation, f.name) for f in fields(Actuation)}
         idle, one = (hand.controls(grasps, jnp.full_like(grasps.spring_efforts, effort)) for effort in (0, 1))
         columns |= actuation | {"idle_controls": idle, "controls_per_effort": one - idle}

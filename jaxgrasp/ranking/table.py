@@ -4,7 +4,7 @@ import itertools
 import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 import pyarrow as pa
@@ -101,6 +101,8 @@ def _write_parquet(ranking: Ranking, stream: BinaryIO) -> None:
     first = next(pieces)
     # Numbers hardly ever repeat: a dictionary of them would be given up after it was made.
     texts = [field.name for field in first.schema if not pa.types.is_floating(field.type)]
+    # Its annotation says bool, its documentation "bool or list".
+    texts = cast(bool, texts)
     with parquet.ParquetWriter(stream, first.schema, compression="zstd", use_dictionary=texts) as writer:
         for piece in itertools.chain([first], pieces):
             writer.write_table(piece)

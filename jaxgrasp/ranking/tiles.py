@@ -114,6 +114,7 @@ def tightening(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str,
     solution = least_effort(contacts, disturbances, columns["wanted"], **task)
     controls = jnp.zeros((len(solution.effort), 0), solution.effort.dtype)
     if "controls_per_effort" in columns:
+        assert solution.actuator_efforts is not None
         own = solution.actuator_efforts[:, : columns["idle_controls"].shape[-1]]
         controls = columns["idle_controls"] + columns["controls_per_effort"] * own
     return solution.forces, solution.forces_in_object_frame(contacts), solution.effort, solution.status, controls

@@ -11,6 +11,7 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import Compliance, pseudo_inverse
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.kernels import Plain
 
@@ -42,14 +43,14 @@ class _BlockingForces(Plain):
     rows = 8
 
     def evaluate(self, grasps: Grasps) -> jax.Array:
-        scaled = grasps.terms[0].wrenches * grasps.units
+        scaled = wrenches_of(grasps.terms) * grasps.units
         if grasps.vertex_halves is None:
             inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
             # Spelt out: products of matrices are library calls, which a tile cannot make.
             parts = [jnp.moveaxis(inverse[:, e], 0, 1) * scaled[:, e][:, None, None] for e in range(6)]
             forces = -fold(jnp.add, parts)
         else:
-            one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
+            one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])
             forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
         forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
         return jnp.where(grasps.valid, forces, jnp.nan)

@@ -19,6 +19,7 @@ from jax import lax
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import RANK_TOLERANCE, pseudo_inverse, whitened
 from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.program import LEAST_FRICTION
 from jaxgrasp.solvers.conic_margin import ConeRows, ConicMargin
@@ -97,12 +98,12 @@ def basics(grasps: Grasps, with_answers: bool) -> Basics:
     mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
     rows = whitened(grasps.columns * (sizes / mean))
     (lanes,) = mean.shape
-    given = grasps.terms[0].wrenches
+    given = wrenches_of(grasps.terms)
     wrenches = jnp.swapaxes(jnp.broadcast_to(given, (*given.shape[:2], lanes)), 0, 1) * grasps.units[:, None]
 
     def coordinates(wrench: jax.Array) -> tuple[jax.Array, jax.Array]:
         """In the orthonormal rows, and whether something is left outside them."""
-        spread = lambda x: x.reshape(*x.shape[:-1], *[1] * (wrench.ndim - 2), lanes)  # noqa: E731
+        spread = lambda x: x.reshape(*x.shape[:-1], *[1] * (wrench.ndim - 2), lanes)
         own = fold(jnp.add, [spread(rows.operations[:, c]) * wrench[c] for c in range(6)])
         lost = fold(jnp.maximum, jnp.abs(lax.stop_gradient(own)) * (1 - spread(rows.kept)))
         return own * spread(rows.kept), lost > tolerance * fold(jnp.maximum, jnp.abs(wrench))
@@ -139,6 +140,7 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
         sigmas = [kind * last for kind in kinds]
     else:
         border = jnp.zeros((6, 1 if form.shared else count, lanes), dtype)
+        assert basics.answers is not None
         given = jnp.moveaxis(basics.answers / basics.sizes, 0, 2)
         sigmas = [jnp.where(present[:, None] > 0, part.apply(given), 0) for part in parts]
         if not form.exact:
@@ -156,7 +158,7 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
         if form.exact:
             sigmas = [jnp.concatenate([sigma, jnp.zeros_like(sigma[:, :1])], 1) for sigma in sigmas]
         sigmas = [jnp.where(idle, kind, sigma * scale) for sigma, kind in zip(sigmas, kinds, strict=True)]
-    lift = lambda sigma: jnp.broadcast_to(sigma, (*sigma.shape[:3], *border.shape[1:]))  # noqa: E731
+    lift = lambda sigma: jnp.broadcast_to(sigma, (*sigma.shape[:3], *border.shape[1:]))
     problem = ConicMargin(
         rows=tuple(replace(part, sigma=lift(sigma)) for part, sigma in zip(parts, sigmas, strict=True)),
         columns=basics.columns[..., None, :],
@@ -173,7 +175,7 @@ def blocking(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
         inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
         forces = -jnp.einsum("aen...,ed...->dan...", inverse, wrenches)
     else:
-        one = lambda each: -jnp.einsum("aen...,e...->an...", pseudo_inverse(grasps.columns, each[0])[0], each[1])  # noqa: E731
+        one = lambda each: -jnp.einsum("aen...,e...->an...", pseudo_inverse(grasps.columns, each[0])[0], each[1])
         forces = lax.map(one, (grasps.vertex_halves, jnp.swapaxes(wrenches, 0, 1)))
     return jnp.where(grasps.present > 0, forces, 0)
 
@@ -181,7 +183,7 @@ def blocking(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
 def contact_rows(exact: bool, cone_edges: int, norm_bound: bool, friction: jax.Array) -> list[ConeRows]:
     """The rows of a contact, without sigma: friction, then the bound on the force."""
     none = jnp.zeros((1, 1, 1, 1, 1), friction.dtype)
-    make = lambda kind, patterns, h, stretch=None: ConeRows(  # noqa: E731
+    make = lambda kind, patterns, h, stretch=None: ConeRows(
         second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch
     )
     normal = (0.0, 0.0, -1.0)

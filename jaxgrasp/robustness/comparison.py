@@ -143,7 +143,7 @@ def _binding(contacts: Contacts, reduced: Solution, unreduced: FormulationSoluti
     loads = jnp.take_along_axis(loads, row[..., None, None], -1)[..., 0]
     answered = jnp.isfinite(reduced.margin) & (reduced.margin >= 0) & (jnp.max(flat, -1) > 0)
     direction = jnp.where(jnp.max(loads, -1) > 0, jnp.argmax(loads, -1), -1)
-    told = lambda v: jnp.where(answered, v, -1).astype(jnp.int32)  # noqa: E731
+    told = lambda v: jnp.where(answered, v, -1).astype(jnp.int32)
     return Binding(direction=told(direction), contact=told(contact), row=told(row))
 
 

@@ -79,7 +79,7 @@ def envelope_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     weight = jnp.where(point.usable, cotangents[0], 0)
     if grasps.actuated is not None:
         return _lagrangian_gradient(cone_edges, grasps, point, weight)
-    clean = lambda x: jnp.where(point.usable, x, 0)  # noqa: E731
+    clean = lambda x: jnp.where(point.usable, x, 0)
     force, z_cone = clean(jnp.moveaxis(point.forces, 1, 0)), clean(jnp.moveaxis(point.cone_multipliers, 1, 0))
     z_cone, z_bound = -z_cone * weight * grasps.present, -clean(point.bound_multipliers) * weight * grasps.present
     y = clean(point.wrench_multipliers) * weight
@@ -155,8 +155,8 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     forces = jnp.where(point.usable, point.forces, 0)
     scales = jnp.stack([program.tangential, program.tangential, program.normal])
     row_units = program.row_units()
-    given = lambda ct: None if ct is None else jnp.where(point.usable, ct, 0)  # noqa: E731
-    ct = Point(*map(given, cotangents))
+    given = lambda ct: None if ct is None else jnp.where(point.usable, ct, 0)
+    ct = cotangents._replace(**{name: given(part) for name, part in cotangents._asdict().items()})
 
     pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
     effort_weights = None
@@ -232,7 +232,7 @@ def _actuated_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents:
         return _point(grasps, scaled_program(grasps, cone_edges), iterate, unit, point.usable)._replace(usable=None)
 
     out, pull = jax.vjp(read, grasps, iterate)
-    given = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)  # noqa: E731
+    given = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)
     known = {name: given(getattr(cotangents, name), like) for name, like in out._asdict().items() if like is not None}
     direct, back = pull(out._replace(**known))
     right_x, right_lambda = back.x if problem.bordered else (back.x, None)
@@ -295,12 +295,13 @@ def _iterate(
     problem: BlockProblem, program: Program, point: Point, unit: jax.Array, kappa: jax.Array | None
 ) -> Iterate:
     """The scaled iterate; s from s z = kappa, or from the rows where kappa is None. Harmless where of no use."""
-    clean = lambda x, other: jnp.where(point.usable, x, other)  # noqa: E731
+    clean = lambda x, other: jnp.where(point.usable, x, other)
     forces = clean(jnp.moveaxis(point.forces, 1, 0), 0) * program.present
     x = [forces / jnp.stack([program.tangential, program.tangential, program.normal])]
     z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
     z = [clean(z * program.row_units() / unit, 1) * program.present]
     if program.efforts is not None:
+        assert point.actuator_multipliers is not None
         x.append((clean(point.actuator_efforts, 0) / program.efforts.unit)[None])
         z.append(clean(jnp.moveaxis(point.actuator_multipliers, 1, 0) * program.efforts.unit / unit, 1))
     lam = clean(point.margin, 0) / program.scale

@@ -20,7 +20,7 @@ from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.disturbance.vertices import Vertices
+from jaxgrasp.disturbance.vertices import Vertices, wrenches_of
 from jaxgrasp.robustness.answers import (
     ACCEPTED,
     FormulationSolution,
@@ -51,7 +51,7 @@ from jaxgrasp.robustness.chain import (
     scaled_formulation,
 )
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.kernels import Along
+from jaxgrasp.robustness.kernels import Along, Tree
 from jaxgrasp.solvers.conic_margin import ConicPoint
 from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.lanes import Each
@@ -139,7 +139,7 @@ def tile_of(contacts: Contacts, disturbances: DisturbanceSet) -> int:
 
     Of 32 to 1,024 with four contacts and six directions 32 were fastest, by a factor of five.
     """
-    directions = disturbances.terms[0].wrenches.shape[-2] + 1
+    directions = wrenches_of(disturbances.terms).shape[-2] + 1
     return 1 << max(3, (_TILE // (contacts.n_c * directions)).bit_length() - 1)
 
 
@@ -176,7 +176,8 @@ class Chain(Audited):
             margin, directions = changes[name]
             moved: dict[str, Any] = {"margin": margin, "upper_bound": margin, "directions": directions}
             still = jax.tree.map(lambda _: None, point)
-            changed[name] = FormulationSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), still
+            leaves: dict[str, Tree] = {f.name: moved.get(f.name) for f in fields(solution)}
+            changed[name] = FormulationSolution(**leaves), still
         return changed
 
     def judge(self, arguments: Arguments, out: dict, anew: bool) -> dict[str, ChainVerdict]:
@@ -287,7 +288,7 @@ class Chain(Audited):
 
         def value(grasps: Grasps) -> jax.Array:
             _, scaled = self._scaled(grasps)
-            lagrangian = lambda name: scaled[self._twin(name)].problem.lagrangian(points[name])  # noqa: E731
+            lagrangian = lambda name: scaled[self._twin(name)].problem.lagrangian(points[name])
             return -fold(jnp.add, [jnp.sum(weights[name] * lagrangian(name)) for name in held])
 
         return jax.grad(value, allow_int=True)(grasps)

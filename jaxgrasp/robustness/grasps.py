@@ -77,6 +77,12 @@ class Grasps:
     """What the hand's actuators can do; None where the fingers can push at will."""
 
     @property
+    def asked(self) -> jax.Array:
+        """`margin`, of grasps for which one is asked for."""
+        assert self.margin is not None
+        return self.margin
+
+    @property
     def rows(self) -> jax.Array:
         """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
         return stacked_rows(self.columns, self.actuated)
@@ -180,6 +186,7 @@ def admitted(arguments: Arguments, raw: dict[str, jax.Array]) -> Grasps:
     if "per_vertex" in raw:
         each = jnp.moveaxis(raw["per_vertex"], 0, -1)
         vertex_halves, usable = inverse_root(_masked(each, active[..., None]), n)
+        assert vertex_halves is not None
         vertex_halves, valid = jnp.moveaxis(vertex_halves, -1, 0), valid & usable.all(-1)
     weights, weight_roots = _masked(raw.get("weights"), active), None
     if weights is not None:
@@ -271,7 +278,7 @@ def _sound_actuation(raw: dict[str, jax.Array], active: jax.Array) -> jax.Array:
     if "jacobian" not in raw:
         return jnp.array(True)
     # A sum is finite where all of its terms are. Spelt out: large reductions are library calls.
-    total = lambda x: fold(jnp.add, fold(jnp.add, jnp.abs(x)))  # noqa: E731
+    total = lambda x: fold(jnp.add, fold(jnp.add, jnp.abs(x)))
     sound = (jnp.isfinite(total(jnp.moveaxis(raw["jacobian"], 0, 2))) | ~active).all(0)
     for name in sorted(_TRANSMISSION & set(raw)):
         sound &= jnp.isfinite(total(raw[name]))

@@ -43,17 +43,19 @@ class Lanes:
 
 
 class Kernel(Protocol):
-    """What is computed for every lane, and how it varies with the arguments.
+    """What is computed for every lane, and how it varies with the arguments."""
 
-    rows: how many rows a contact has but for the bound on its force, which sets the size of a tile.
-    tile: None where it is free of library calls and large reductions, else how many lanes to work on, see `map_lanes`.
-    """
-
-    rows: int
+    @property
+    def rows(self) -> int:
+        """How many rows a contact has but for the bound on its force, which sets the size of a tile."""
+        ...
 
     @property
     def tile(self) -> int | None:
-        """See above."""
+        """None where it is free of library calls and large reductions, else how many lanes to work on.
+
+        See `map_lanes`.
+        """
         ...
 
     @property
@@ -61,7 +63,7 @@ class Kernel(Protocol):
         """See `map_lanes`; the first takes (admitted arguments, held)."""
         ...
 
-    def tangents(self, along: "Along", out: Tree) -> Tree:
+    def tangents(self, along: "Along", out: Tree, /) -> Tree:
         """The derivative of the results along a change of the arguments; None where it is zero."""
         ...
 
@@ -90,7 +92,7 @@ class Plain(ABC):
         return (lambda admitted, _: self.evaluate(admitted),)
 
     @abstractmethod
-    def evaluate(self, admitted: Any) -> Tree:
+    def evaluate(self, admitted: Any, /) -> Tree:
         """The results, lanes last."""
 
     def tangents(self, along: "Along", out: Tree) -> Tree:
@@ -194,7 +196,7 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()
         if not moved:
             return out, jax.tree.map(partial(zero_from_primal, symbolic_zeros=True), out)
         change = kernel.tangents(Along(lanes, arguments, moved), out)
-        still = lambda x, dot: zero_from_primal(x, symbolic_zeros=True) if dot is None else dot  # noqa: E731
+        still = lambda x, dot: zero_from_primal(x, symbolic_zeros=True) if dot is None else dot
         return out, jax.tree.map(still, out, change, is_leaf=lambda x: x is None)
 
     return value(arguments, held)

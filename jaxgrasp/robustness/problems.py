@@ -35,7 +35,7 @@ def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort
     """(22)."""
     blocks, *others = program.groups
     dtype = program.rhs.dtype
-    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.margin / program.scale)
+    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.asked / program.scale)
     eye = jnp.eye(3, dtype=dtype)[..., None, None]
     # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
     root = eye if grasps.weight_roots is None else grasps.weight_roots
@@ -55,7 +55,7 @@ def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort
         program.radius,
         _REFINEMENTS[dtype.name],
         guess,
-        tuple(least_curvature(g.hessian) for g in groups),
+        tuple(least_curvature(g.root) for g in groups),
     )
     return Effort(problem, wanted, largest)
 

@@ -135,10 +135,9 @@ class Program:
         """Multipliers of G f = b (6, *lanes) from those of the orthonormal rows, per unit of the scaled objective."""
         return self.row_multipliers(y)[:6] / self.mean * units
 
-    def joint_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array | None:
-        """The same of J'f - B u = 0, (n_v, *lanes)."""
-        if self.joint_sizes is None:
-            return None
+    def joint_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
+        """The same of J'f - B u = 0, (n_v, *lanes), where there are actuators."""
+        assert self.joint_sizes is not None
         return self.row_multipliers(y)[6:] / self.mean / self.joint_sizes * units[5]
 
     def row_multipliers(self, y: jax.Array) -> jax.Array:
@@ -184,13 +183,13 @@ def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
         return sigmas, h, scale, undisturbed
 
     unit = None if grasps.actuated is None else effort_unit(grasps.actuated)
-    effort = None if effort is None else effort / unit
+    effort = None if effort is None or unit is None else effort / unit
     sigmas, h, scale, undisturbed = scale_rows(cone, bound, effort, tangential, normal, grasps.reserve)
     mean = fold(jnp.add, normal * present) / jnp.maximum(fold(jnp.add, present), 1)
     mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
     scales = jnp.stack([tangential, tangential, normal]) / mean
     wrench = grasps.wrench / mean
-    if grasps.actuated is None:
+    if grasps.actuated is None or unit is None:
         given = (grasps.columns * scales,)
         rows = whitened(given[0])
         columns, efforts, sizes = rows.rows, None, None

@@ -6,8 +6,7 @@ then powers of two. The first large size that comes has programs of its own.
 """
 
 from collections.abc import Hashable
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import jax
 
@@ -28,7 +27,8 @@ _TREES = {"compliance", "actuation"}
 _known: dict[Hashable, set[int]] = {}
 
 
-class Filled(NamedTuple):
+@dataclass(frozen=True)
+class Filled:
     """Arguments of a direct call; `count` grasps were asked for, the others are copies."""
 
     contacts: Contacts
@@ -60,7 +60,9 @@ def with_a_known_size(kernel: Hashable, contacts: Contacts, disturbances: Distur
         return None
     try:
         events = {"required_wrench": (6,), "effort_weights": (contacts.n_c, 3, 3)}
-        spread = {name: _spread(given[name], events.get(name, ()), count, size) for name in given.keys() - _TREES}
+        spread: dict[str, jax.Array | Actuation | None] = {
+            name: _spread(given[name], events.get(name, ()), count, size) for name in given.keys() - _TREES
+        }
         if given["actuation"] is not None:
             spread["actuation"] = _spread_actuation(given["actuation"], contacts.n_c, count, size)
     except _OtherAxes:

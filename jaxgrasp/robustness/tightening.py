@@ -19,7 +19,7 @@ from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, 
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.derivatives import CentralPoint, Point, envelope_adjoint
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
-from jaxgrasp.robustness.kernels import Along, OfPyramids
+from jaxgrasp.robustness.kernels import Along, OfPyramids, Tree
 from jaxgrasp.robustness.program import Program, prepared
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening_lanes import at_centre, evidence, solve_effort, solve_margin
@@ -228,4 +228,5 @@ def _changed(found: tuple[Solution, Evidence | None], change: Point, upper_bound
     """A change of the results; None for what does not vary, or counts as if it did not."""
     varying = change._asdict() | {"upper_bound": upper_bound}
     still = jax.tree.map(lambda _: None, found[1])
-    return Solution(**{f.name: varying.get(f.name) for f in fields(Solution)}), still
+    changes: dict[str, Tree] = {f.name: varying.get(f.name) for f in fields(Solution)}
+    return Solution(**changes), still

@@ -85,7 +85,7 @@ def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, It
     size = jnp.maximum(1, jnp.abs(low))
     # The solver's own bound tells how far it came, the other one whether its rows were the right ones.
     came = jnp.where(jnp.isinf(low), 1, size)
-    apart = lambda upper, unit: jnp.abs(upper - low) <= accepted * unit  # noqa: E731
+    apart = lambda upper, unit: jnp.abs(upper - low) <= accepted * unit
     hopeless = jnp.maximum(low, high) < -settings.tolerance
     told = jnp.where(hopeless, came, _told(program.mean / program.scale, came))
     closed = exact & apart(outcome.record.upper, came) & apart(high, told)
@@ -199,7 +199,7 @@ def solve_effort(grasps: Grasps, program: Program, first: Solution, record: Reco
     dtype, blocks = program.rhs.dtype, program.blocks
     problem, wanted, unit = effort_problem(grasps, program)
     settings = _towards_centre(_EFFORT_SETTINGS[dtype.name], grasps, program, unit**2)
-    reachable = grasps.margin <= first.upper_bound * (1 + settings.tolerance)
+    reachable = grasps.asked <= first.upper_bound * (1 + settings.tolerance)
     held = (reachable & jnp.isfinite(record.lower)) | program.undisturbed
 
     # Between (21)'s answer and its start, which is deep inside the rows, but for those that the margin asks for.
@@ -235,7 +235,7 @@ def solve_effort(grasps: Grasps, program: Program, first: Solution, record: Reco
         Status.MAX_ITERATIONS,
     ).astype(jnp.int32)
     answered = active & jnp.isfinite(best.upper)
-    hide = lambda x: jnp.where(answered, x, jnp.nan)  # noqa: E731
+    hide = lambda x: jnp.where(answered, x, jnp.nan)
     attained = jnp.where(program.undisturbed, jnp.inf, attained * program.scale)
     attained = jnp.where(program.disturbance_outside | program.slippery, 0, attained)
     forces = program.forces(best.x[0]) * blocks.present[:, None]

@@ -28,7 +28,7 @@ from jaxgrasp.robustness.auditing.pyramids import balanced
 from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formulation
 from jaxgrasp.robustness.formulations import check_vertices, tile_of
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.kernels import Along, OfPyramids
+from jaxgrasp.robustness.kernels import Along, OfPyramids, Tree
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.arrow_problem import ArrowProblem, patterns_of
 from jaxgrasp.solvers.embedding import ConicOutcome
@@ -137,13 +137,13 @@ class _TotalEffort(OfPyramids, Audited):
         solution, record = out
         (change,) = along.adjoint(self._adjoint, out, (solution.effort,))
         moved = {"effort": change, "lower_bound": change}
-        return TotalEffortSolution(**{f.name: moved.get(f.name) for f in fields(solution)}), jax.tree.map(
-            lambda _: None, record
-        )
+        changes: dict[str, Tree] = {f.name: moved.get(f.name) for f in fields(solution)}
+        return TotalEffortSolution(**changes), jax.tree.map(lambda _: None, record)
 
     def judge(self, arguments: Arguments, out: tuple, anew: bool) -> EffortVerdict:
         """See `Audited`."""
         problem, (solution, record) = problem_of(arguments), out
+        assert problem.margin is not None
         wrenches = disturbed_wrenches(problem, jnp.broadcast_to(problem.margin[:, None], solution.changes.shape[:2]))
         disturbed, check = solution.forces[:, None] + solution.changes, (False, self.cone_edges, False)
         holds = balanced(problem, solution.forces) & admissible(problem, solution.forces, *check)
@@ -183,7 +183,7 @@ class _TotalEffort(OfPyramids, Audited):
         answer = verdict(grasps, shared, scale, _FREE, found)
         # Each direction on its way from f_0 to the most that it allows: inside the rows.
         some = answer.answered & jnp.isfinite(answer.directions) & (answer.directions > 0)
-        share = jnp.where(some, grasps.margin / jnp.where(some, answer.directions, 1), 0)
+        share = jnp.where(some, grasps.asked / jnp.where(some, answer.directions, 1), 0)
         x, rest = found.point.x, found.point.x[:, :, -1:]
         guess = jnp.concatenate([rest + jnp.clip(share, 0, 1) * (x[:, :, :-1] - rest), rest], 2)
         return grasps, shared, answer, guess
@@ -194,7 +194,7 @@ class _TotalEffort(OfPyramids, Audited):
         settings = _SETTINGS[dtype]
         bearable = answer.answered
         most = jnp.maximum(jnp.min(answer.upper, 0), jnp.min(answer.directions, 0))
-        active = bearable & (grasps.margin <= most * (1 + settings.tolerance))
+        active = bearable & (grasps.asked <= most * (1 + settings.tolerance))
         # Without a load and disturbances no forces at all are the answer. What rounding leaves of nothing counts as
         # nothing: a grasp that withstands none has no room inside its rows.
         idle = active & (jnp.abs(problem.rhs) <= _NOTHING[dtype]).all((0, 1))
@@ -207,7 +207,7 @@ class _TotalEffort(OfPyramids, Audited):
             Status.MAX_ITERATIONS,
         ).astype(jnp.int32)
         answered = active & jnp.isfinite(record.upper)
-        hide = lambda v: jnp.where(answered, v, jnp.nan)  # noqa: E731
+        hide = lambda v: jnp.where(answered, v, jnp.nan)
         forces = jnp.moveaxis(record.x * (shared.sizes * grasps.present)[:, :, None], (2, 1), (0, 1))
         solution = TotalEffortSolution(
             effort=hide(record.upper * unit),
@@ -249,7 +249,7 @@ def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) 
     change = scaled(change)
     largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (own, change)])
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
-    targets = jnp.concatenate([shared.load[:, None] - grasps.margin * shared.targets, shared.load[:, None]], 1)
+    targets = jnp.concatenate([shared.load[:, None] - grasps.asked * shared.targets, shared.load[:, None]], 1)
     patterns, h = patterns_of(pyramid_facets(cone_edges), dtype, 3)
     problem = ArrowProblem(
         patterns=patterns,

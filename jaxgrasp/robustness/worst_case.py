@@ -20,6 +20,7 @@ from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.sets import furthest, support
 from jaxgrasp.disturbance.terms import Term
+from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.fence import each, fenced
 from jaxgrasp.robustness.efforts import effort_reach
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
@@ -54,7 +55,7 @@ def worst_case(
 class _WorstCase(OfPyramids, Plain):
     def evaluate(self, grasps: Grasps) -> tuple[jax.Array, jax.Array]:
         cone, bound, *_ = worst_rows(grasps, self.cone_edges)
-        hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)  # noqa: E731
+        hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)
         return hide(jnp.moveaxis(-cone, 0, 1)), hide(bound)
 
 
@@ -85,7 +86,7 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, j
         if grasps.actuated is not None:
             shapes.append((2, grasps.actuated.transmission.shape[1], *lanes))
         none = tuple(jnp.zeros(shape, grasps.present.dtype) for shape in shapes)
-        (reach, *rest), _ = lax.scan(worse, none, (grasps.vertex_halves, grasps.terms[0].wrenches))
+        (reach, *rest), _ = lax.scan(worse, none, (grasps.vertex_halves, wrenches_of(grasps.terms)))
         efforts = rest[0] if rest else None
     reach = jnp.where(grasps.present > 0, reach, 0)
     return reach[:-1], reach[-1], efforts, basis

@@ -15,14 +15,16 @@ scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1; ra
 Callers scale: |x| about 1 at most, sigma <= 1, the rows of E orthonormal or zero.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.fence import each, fenced, repeat
+from jaxgrasp.solvers.interior_point import Iterate, Residuals
 
 Rows = tuple[jax.Array, ...]
 # Matrices of the equality rows up to this size are factored as they are.
@@ -49,6 +51,12 @@ class Blocks(NamedTuple):
     hessian: jax.Array | None
     start: jax.Array
 
+    @property
+    def root(self) -> jax.Array:
+        """`hessian`, of blocks that have one."""
+        assert self.hessian is not None
+        return self.hessian
+
 
 class Record(NamedTuple):
     """Best bounds so far, certified, and the points that give them: x one of them, (y, z) the other."""
@@ -70,14 +78,20 @@ class _BlockFactor(NamedTuple):
     lean: jax.Array | None  # (n, *lanes), what of sigma'W sigma the unknowns of the block cannot make up for
 
 
+class _Border(NamedTuple):
+    """What a free lambda adds to the reduced Newton system."""
+
+    inverse: jax.Array  # inverse pivot of lambda
+    column: jax.Array  # (eq, *lanes), lambda's column in the equality rows
+
+
 class Factors(NamedTuple):
-    """The reduced Newton system; `border` and `v` are None where lambda is held."""
+    """The reduced Newton system; `border` is None where lambda is held."""
 
     blocks: list[_BlockFactor]
     root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of the equality rows' matrix
     weights: Rows
-    border: jax.Array | None  # inverse pivot of lambda
-    v: jax.Array | None  # (eq, *lanes), lambda's column in the equality rows
+    border: _Border | None
 
 
 def apply_rows(group: Blocks, x: jax.Array) -> jax.Array:
@@ -92,8 +106,8 @@ def adjoint_rows(group: Blocks, z: jax.Array) -> jax.Array:
 
 def apply_hessian(group: Blocks, x: jax.Array) -> jax.Array:
     """H x = root' root x, (k, n, *lanes)."""
-    half = fold(jnp.add, jnp.moveaxis(group.hessian * x, 1, 0))
-    return fold(jnp.add, group.hessian * half[:, None])
+    half = fold(jnp.add, jnp.moveaxis(group.root * x, 1, 0))
+    return fold(jnp.add, group.root * half[:, None])
 
 
 def spread_over(values: jax.Array, like: jax.Array) -> jax.Array:
@@ -145,13 +159,12 @@ def inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array
     size, lanes = matrix.shape[0], matrix.shape[2:]
     index = jnp.arange(size).reshape(size, *[1] * len(lanes))
     eye = jnp.eye(size, dtype=matrix.dtype).reshape(size, size, *[1] * len(lanes))
-    if floor is None:
-        floor = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix)
+    least = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix) if floor is None else floor
     if size > _UNDIVIDED:
         half = size // 2
-        first = inverse_root(matrix[:half, :half], floor[:half])
+        first = inverse_root(matrix[:half, :half], least[:half])
         across = _times_transposed(matrix[half:, :half], first)
-        last = inverse_root(matrix[half:, half:] - _times_transposed(across, across), floor[half:])
+        last = inverse_root(matrix[half:, half:] - _times_transposed(across, across), least[half:])
         corner = -_times(last, _times(across, first))
         zero = jnp.zeros((half, size - half, *lanes), matrix.dtype)
         return jnp.concatenate([jnp.concatenate([first, zero], 1), jnp.concatenate([corner, last], 1)])
@@ -161,7 +174,7 @@ def inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array
 
         @fenced
         def scale(left: jax.Array) -> tuple:
-            inverse = jax.lax.rsqrt(jnp.maximum(left[j, j], floor[j]))
+            inverse = jax.lax.rsqrt(jnp.maximum(left[j, j], least[j]))
             return inverse, jnp.where(index > j, left[:, j], 0) * (inverse * inverse)
 
         @fenced
@@ -186,7 +199,7 @@ def _times_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @dataclass(frozen=True)
-class BlockProblem:
+class BlockProblem(ABC):
     """What both programs share.
 
     groups: the blocks.
@@ -217,6 +230,14 @@ class BlockProblem:
     def predictor(self) -> Self:
         """Without refinement, which changes neither the steps that are taken nor what they end at."""
         return replace(self, refinements=0)
+
+    @abstractmethod
+    def residuals(self, iterate: Iterate) -> Residuals:
+        """See `interior_point.Problem`."""
+
+    @abstractmethod
+    def solve(self, factors: Factors, residuals: Residuals, shift: Rows) -> tuple[Any, jax.Array, Rows]:
+        """See `interior_point.Problem`; dx is like the problem's own x."""
 
     def equality(self, x: Rows) -> jax.Array:
         """E x, (eq, *lanes)."""
@@ -259,17 +280,18 @@ class BlockProblem:
                 return matrix, None, None
             sides = [_over_blocks(c * -t, 1) for f in blocks for c, t in zip(f.columns, f.theta, strict=True)]
             # A sum of squares: sigma'W sigma - p'P^-1 p would cancel near the optimum.
-            kappa = fold(jnp.add, [fold(jnp.add, f.lean) for f in blocks])
+            kappa = fold(jnp.add, [fold(jnp.add, f.lean) for f in blocks if f.lean is not None])
             return matrix, fold(jnp.add, sides), 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
 
         @fenced
-        def complete(matrix: jax.Array, v: jax.Array | None, border: jax.Array | None) -> jax.Array:
+        def complete(matrix: jax.Array, v: jax.Array | None, inverse: jax.Array | None) -> jax.Array:
             eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(*matrix.shape[:2], *[1] * len(self.lanes))
             matrix = matrix + eye * self.dropped
-            return matrix if v is None else matrix + v[:, None] * (v * border)
+            return matrix if v is None or inverse is None else matrix + v[:, None] * (v * inverse)
 
-        matrix, v, border = reduce(blocks)
-        return Factors(blocks, inverse_root(complete(matrix, v, border)), weights, border, v)
+        matrix, v, inverse = reduce(blocks)
+        border = _Border(inverse, v) if self.bordered else None
+        return Factors(blocks, inverse_root(complete(matrix, v, inverse)), weights, border)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
         """Orthogonalise [A, sigma] column by column, in the inner product that the weights give.
@@ -310,7 +332,10 @@ class BlockProblem:
         return _BlockFactor(below, inverse, reduced(below, inverse), theta, lean)
 
     def newton(self, factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
-        """Solve [P p E'; p' hll 0; E 0 0] (dx, dlambda, dy) = (rhs_x, rhs_lambda, rhs_y)."""
+        """Solve [P p E'; p' hll 0; E 0 0] (dx, dlambda, dy) = (rhs_x, rhs_lambda, rhs_y).
+
+        rhs_lambda and dlambda are None where lambda is held.
+        """
 
         @fenced
         def eliminate(factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
@@ -323,29 +348,29 @@ class BlockProblem:
                 for c, t, a in zip(f.columns, f.theta or f.inverse, r, strict=True)
             ]
             right = fold(jnp.add, [_over_blocks(c * a, 1) for c, _, a in pairs]) - rhs_y
-            if not self.bordered:
+            if rhs_lambda is None:
                 return reduced, right, None
             return reduced, right, rhs_lambda - fold(jnp.add, [fold(jnp.add, t * a) for _, t, a in pairs])
 
         @fenced
         def solve_equalities(factors: Factors, right: jax.Array, pull: jax.Array | None) -> jax.Array:
-            if self.bordered:
-                right = right + factors.v * (pull * factors.border)
+            if factors.border is not None and pull is not None:
+                right = right + factors.border.column * (pull * factors.border.inverse)
             return fold(jnp.add, jnp.moveaxis(factors.root * right, 1, 0))
 
         @fenced
         def finish_equalities(factors: Factors, half: jax.Array, pull: jax.Array | None) -> tuple:
             dy = fold(jnp.add, factors.root * half[:, None])
-            if not self.bordered:
+            if factors.border is None or pull is None:
                 return dy, None
-            return dy, (pull - fold(jnp.add, factors.v * dy)) * factors.border
+            return dy, (pull - fold(jnp.add, factors.border.column * dy)) * factors.border.inverse
 
         @fenced
         def substitute(factors: Factors, reduced: list, dy: jax.Array, dlambda: jax.Array | None) -> Rows:
             out = []
             for f, r in zip(factors.blocks, reduced, strict=True):
                 left = [a - fold(jnp.add, c * dy[:, None]) for c, a in zip(f.columns, r, strict=True)]
-                if self.bordered:
+                if dlambda is not None:
                     left = [a - t * dlambda for a, t in zip(left, f.theta, strict=True)]
                 out.append(jnp.stack(_substitute_up(f.below, f.inverse, left)))
             return tuple(out)

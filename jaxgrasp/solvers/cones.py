@@ -74,7 +74,7 @@ def product(second_order: bool, u: jax.Array, v: jax.Array) -> jax.Array:
 
 def quotient(w: Scaling, v: jax.Array) -> jax.Array:
     """The u with lambda o u = v."""
-    if w.size is None:
+    if w.root is None:
         return v / w.value
     head, tail, square = w.value[0], w.value[1:], w.root * w.root
     first = (head * v[0] - fold(jnp.add, tail * v[1:])) / square
@@ -90,7 +90,7 @@ def identity_like(second_order: bool, v: jax.Array) -> jax.Array:
 
 def overshoot(w: Scaling, d: jax.Array) -> jax.Array:
     """1 / the step along d from lambda to the boundary, <= 0 if none does; leading axis d or, for a cone each, 1."""
-    if w.size is None:
+    if w.root is None:
         return -d / w.value
     unit = w.value / w.root
     first = unit[0] * d[0] - fold(jnp.add, unit[1:] * d[1:])

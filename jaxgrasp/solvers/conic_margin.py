@@ -63,7 +63,7 @@ class ConeRows:
         """The entries 00, 10, 11, 20, 21, 22 of A'W^-2 A summed over copies, (n, *lanes) each."""
         pairs = [(a, b) for a in range(3) for b in range(a + 1)]
         rows = np.array(self.patterns)
-        if not self.second_order:
+        if w.size is None:
             weights = along(jnp.add, jnp.moveaxis(1 / (w.point * w.point), 1, 0))
             table = literal(np.stack([rows[:, a] * rows[:, b] for a, b in pairs], 1), weights.dtype)
             entries = list(fold(jnp.add, spread_over(table, weights) * weights[:, None]))

@@ -128,7 +128,7 @@ def least_curvature(root: jax.Array) -> jax.Array:
         root: (k, k, n, *lanes), H = root' root.
     """
     matrix = jnp.stack([fold(jnp.add, root * column[:, None]) for column in jnp.moveaxis(root, 1, 0)])
-    rest = lambda a, row: [jnp.abs(entry) for b, entry in enumerate(row) if b != a]  # noqa: E731
+    rest = lambda a, row: [jnp.abs(entry) for b, entry in enumerate(row) if b != a]
     return jnp.maximum(jnp.stack([row[a] - sum(rest(a, row)) for a, row in enumerate(matrix)]), 0)
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.experimental.custom_partitioning import ArrayMapping, SdyShardingRule, custom_partitioning
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir, xla
@@ -136,7 +137,7 @@ def types(avals: Sequence[Any], shared: Sequence[bool], out: Events) -> list:
     own = next(a for a, s in zip(avals, shared, strict=True) if not s)
     lead = own.sharding.spec[0]
     return [
-        jax.core.ShapedArray(
+        ShapedArray(
             (own.shape[0], *shape),
             dtype,
             sharding=own.sharding.update(spec=_spread(lead, len(shape) + 1)),
@@ -157,7 +158,7 @@ def _lower(ctx: Any, *leaves: Any, function: Function, shared: Any, out: Events,
         with on_one_device():
             return function(list(leaves), shared, platform)
 
-    plain = lambda avals: [jax.core.ShapedArray(a.shape, a.dtype) for a in avals]  # noqa: E731
+    plain = lambda avals: [ShapedArray(a.shape, a.dtype) for a in avals]
     inside = ctx.replace(avals_in=plain(ctx.avals_in), avals_out=plain(ctx.avals_out))
     divided = devices is not None and _is_divided(ctx.module_context.axis_context)
     with on_one_device():
@@ -186,7 +187,7 @@ def _divided(run: Callable, shared: tuple[bool, ...], ctx: Any) -> Callable:
 
     def partition(mesh: Any, given: tuple, wanted: list) -> tuple:
         lead = next(x.sharding.spec[0] for x, s in zip(given, shared, strict=True) if not s)
-        place = lambda x, s: NamedSharding(mesh, _spread(None if s else lead, len(x.shape)))  # noqa: E731
+        place = lambda x, s: NamedSharding(mesh, _spread(None if s else lead, len(x.shape)))
         return mesh, run, [place(x, False) for x in wanted], tuple(map(place, given, shared))
 
     divided = custom_partitioning(run)

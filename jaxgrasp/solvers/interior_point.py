@@ -227,7 +227,9 @@ def _predict_correct(
     factors = problem.factor(weights)
 
     @fenced
-    def towards_optimum(z: Tree, rows: Tree, weights: Tree, lacking: Tree, inverse_s: Tree) -> tuple:
+    def towards_optimum(
+        z: Tree, rows: Tree, weights: Tree, lacking: Tree, inverse_s: Tree
+    ) -> tuple[Tree, Tree, jax.Array, jax.Array]:
         """The affine ds and dz, and the reciprocals of the steps that reach the boundary; dz / z is -1 - ds / s."""
         ds = jax.tree.map(lambda r, a: -r - a, lacking, rows)
         dz = jax.tree.map(lambda z, w, d: -(z + w * d), z, weights, ds)

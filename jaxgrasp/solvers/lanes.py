@@ -77,13 +77,13 @@ def map_lanes(
     alike = jax.tree.leaves(shared)
     if any(x.size == 0 for x in leaves):
         one = [x if s else jnp.zeros((1, *x.shape[1:]), x.dtype) for x, s in zip(leaves, alike, strict=True)]
-        again = lambda one: map_lanes(  # noqa: E731
+        again = lambda one: map_lanes(
             stages, jax.tree.unflatten(structure, one), shared, rows, compact=compact, tile=tile
         )
         return jax.tree.map(lambda x: jnp.zeros((0, *x.shape[1:]), x.dtype), jax.eval_shape(again, one))
     rows = rows if compact else 0
     run: list[Callable] = []
-    named = lambda part: known_as and f"{known_as} {part} {structure}"  # noqa: E731
+    named = lambda part: known_as and f"{known_as} {part} {structure}"
     for number, stage in enumerate(stages):
         if not isinstance(stage, Each):
             run.append(stage)
@@ -117,7 +117,7 @@ def _run(
     def run(leaves: list[jax.Array]) -> Tree:
         out = _outline(work, leaves, shared, known_as)
         wanted, structure = jax.tree.flatten(out)
-        flat = lambda *args: jax.tree.leaves(work(*args))  # noqa: E731
+        flat = lambda *args: jax.tree.leaves(work(*args))
         events = tuple((x.shape[1:], x.dtype) for x in wanted)
         return jax.tree.unflatten(structure, independent(flat, leaves, shared, events))
 
@@ -155,7 +155,7 @@ def tiled(
 ) -> Tree:
     """The stages in turn on one device, in tiles; see `map_lanes`. Rows are 0 where tiles cannot be compact."""
     lanes = next(x.shape[0] for x, s in zip(leaves, shared, strict=True) if not s)
-    first = lambda last: stages[0](jax.tree.unflatten(structure, last))  # noqa: E731
+    first = lambda last: stages[0](jax.tree.unflatten(structure, last))
 
     def enter(parts: list[jax.Array]) -> Tree:
         return first([x[..., None] if s else jnp.moveaxis(x, 0, -1) for x, s in zip(parts, shared, strict=True)])

@@ -125,7 +125,7 @@ def _run(*args: jax.Array, spec: _Map) -> list[jax.Array]:
     tangents = _split(spec, args)[1]
     if tangents[0].shape[0] == 0:
         return [jnp.zeros((0, *shape), dtype) for shape, dtype in spec.outputs]
-    stage = lambda leaves: spec.kernel(*_split(spec, leaves))  # noqa: E731
+    stage = lambda leaves: spec.kernel(*_split(spec, leaves))
     rows = spec.rows if spec.adjoint is None else 0
     work = partial(tiled, (stage,), jax.tree.structure(list(args)), rows, LOOSE_TILE, None)
     return independent(work, args, _shared(spec, len(args)), spec.outputs)

@@ -22,6 +22,9 @@ The optimal value needs no solve (envelope theorem): with x, y, z held,
 Sources: Amos and Kolter (2017), "OptNet"; Agrawal et al. (2019), "Differentiating through a cone program".
 """
 
+from collections.abc import Sequence
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -30,6 +33,8 @@ from jaxgrasp.compiling import own_settings
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program
 from jaxgrasp.solvers.independent import one_lane
 from jaxgrasp.solvers.interior_point import Iterate
+
+T = TypeVar("T")
 
 # s z is raised to this, so that rows that are only just active, with s and z both zero, keep a finite weight.
 _KAPPA = {"float32": 1e-8, "float64": 1e-14}
@@ -56,14 +61,14 @@ def _solution_jvp(primals: tuple, tangents: tuple) -> tuple[Iterate, Iterate]:
     program, _, solved = primals
     # Once more as a function of the program, for derivatives of the derivatives.
     point = solution_of(*primals)
-    P, _, A, _, G, _ = program = _or(solved, program, Program(*[0.0] * 6))
+    P, _, A, _, G, _ = program = _or(solved, program, [0.0] * 6)
     dP, dq, dA, db, dG, dh = tangents[0]
-    x, y, s, z = safe = _or(solved, point, Iterate(0.0, 0.0, 1.0, 1.0))
+    x, y, s, z = safe = _or(solved, point, [0.0, 0.0, 1.0, 1.0])
     ratio = _ratio(safe)
     kkt = Embedding(lax.stop_gradient(program), CONSTANTS[x.dtype.name])
-    factor = lambda _, program, weights: Embedding(program, kkt.constants).reduce(weights)  # noqa: E731
+    factor = lambda _, program, weights: Embedding(program, kkt.constants).reduce(weights)
     factors = one_lane(factor, solved, kkt.program, lax.stop_gradient(1 / ratio))
-    parts = lambda v: jnp.split(v, [x.size, x.size + y.size])  # noqa: E731
+    parts = lambda v: jnp.split(v, [x.size, x.size + y.size])
 
     def matrix(v: jax.Array) -> jax.Array:
         dx, dy, dz = parts(v)
@@ -71,9 +76,9 @@ def _solution_jvp(primals: tuple, tangents: tuple) -> tuple[Iterate, Iterate]:
 
     # One vector: JAX cannot transpose a solve with a part of the right-hand side constant.
     right = jnp.concatenate([-(dP @ x + dq + dA.T @ y + dG.T @ z), db - dA @ x, dh - dG @ x])
-    solve = lambda _, right: jnp.concatenate(kkt.newton(factors, tuple(parts(right))))  # noqa: E731
+    solve = lambda _, right: jnp.concatenate(kkt.newton(factors, tuple(parts(right))))
     dx, dy, dz = parts(lax.custom_linear_solve(matrix, right, solve, symmetric=True))
-    return point, _or(solved, Iterate(dx, dy, -ratio * dz, dz), Iterate(0.0, 0.0, 0.0, 0.0))
+    return point, _or(solved, Iterate(dx, dy, -ratio * dz, dz), [0.0] * 4)
 
 
 @jax.custom_jvp
@@ -87,7 +92,7 @@ def value_at(program: Program, point: Iterate, value: jax.Array, solved: jax.Arr
 def _value_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
     _, point, value, solved = primals
     dP, dq, dA, db, dG, dh = tangents[0]
-    x, y, _, z = _or(solved, point, Iterate(0.0, 0.0, 0.0, 0.0))
+    x, y, _, z = _or(solved, point, [0.0] * 4)
     change = x @ (dP @ x) / 2 + dq @ x + y @ (dA @ x - db) + z @ (dG @ x - dh)
     return value_at(*primals), jnp.where(solved, change, 0)
 
@@ -101,6 +106,8 @@ def _ratio(point: Iterate) -> jax.Array:
     return jnp.maximum(s, kappa / larger) / jnp.maximum(z, kappa / larger)
 
 
-def _or(solved: jax.Array, these: tuple, harmless: tuple) -> tuple:
-    """A tree where the lane is solved, else numbers that make no NaN."""
-    return jax.tree.map(lambda v, other: jnp.where(solved, v, jnp.asarray(other, v.dtype)), these, harmless)
+def _or(solved: jax.Array, these: T, harmless: Sequence[float]) -> T:
+    """A tree where the lane is solved, else numbers that make no NaN, one for every leaf."""
+    leaves, structure = jax.tree.flatten(these)
+    chosen = [jnp.where(solved, v, jnp.asarray(other, v.dtype)) for v, other in zip(leaves, harmless, strict=True)]
+    return jax.tree.unflatten(structure, chosen)

@@ -116,20 +116,20 @@ def _solve_one(program: Program) -> QPSolution:
     settings = Settings(
         constants.tolerance, _MAX_ITERATIONS, constants.step_cap, constants.mu_floor, True, 0.0, _PATIENCE
     )
-    loop = lambda valid, scaled: interior_point.solve(Embedding(scaled, constants), settings, valid)  # noqa: E731
+    loop = lambda valid, scaled: interior_point.solve(Embedding(scaled, constants), settings, valid)
     outcome = one_lane(loop, valid & ~impossible, lax.stop_gradient(scaled))
     record, iterate = outcome.record, outcome.record.iterate
     found = jnp.where(record.error <= constants.accept, record.shows, int(Status.MAX_ITERATIONS))
     status = jnp.where(valid, jnp.where(impossible, int(Status.INFEASIBLE), found), int(Status.INVALID_INPUT))
     tau, iterate = iterate.z[-1], iterate._replace(s=iterate.s[:-1], z=jnp.where(absent, 0, iterate.z[:-1]))
-    at = lambda iterate: Iterate(*map(jnp.multiply, iterate, back))  # noqa: E731
+    at = lambda iterate: Iterate(*map(jnp.multiply, iterate, back))
     answer = _answer(lax.stop_gradient(program), at(iterate), tau, status, outcome.iterations)
     solved = status == Status.SOLVED
     point = at(solution_of(scaled, Iterate(*(v / tau for v in iterate)), solved))
     fields = {name: jnp.where(solved, v, getattr(answer, name)) for name, v in point._asdict().items()}
     objective = value_at(program, point, answer.objective, solved)
     told = replace(answer, objective=objective, **fields)
-    hide = lambda v: jnp.where(impossible, jnp.nan, v)  # noqa: E731
+    hide = lambda v: jnp.where(impossible, jnp.nan, v)
     return replace(
         told,
         s=jnp.where(absent & ~jnp.isnan(told.s), jnp.inf, told.s),

@@ -9,7 +9,7 @@ def cholesky(entries: list[jax.Array]) -> list[jax.Array]:
     """1/L00, L10, 1/L11, L20, L21, 1/L22 of a 3x3 matrix given by 00, 10, 11, 20, 21, 22; pivots are clamped."""
     a00, a10, a11, a20, a21, a22 = entries
     eps = jnp.finfo(a00.dtype).eps
-    pivot = lambda value, diagonal: lax.rsqrt(jnp.maximum(value, eps * diagonal))  # noqa: E731
+    pivot = lambda value, diagonal: lax.rsqrt(jnp.maximum(value, eps * diagonal))
     i0 = pivot(a00, a00)
     l10, l20 = a10 * i0, a20 * i0
     i1 = pivot(a11 - l10 * l10, a11)

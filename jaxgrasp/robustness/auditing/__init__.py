@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.contacts import Contacts
@@ -83,9 +84,9 @@ def audited(
     stride = 1 if form == "strict" else setting.STRIDE
     still = jax.lax.stop_gradient((contacts, disturbances, given, out))
     first = jax.tree.leaves(out)[0]
-    pace = "brief" if isinstance(first, jax.core.Tracer) or first.size > _FEW else "soon"
+    pace = "brief" if isinstance(first, Tracer) or first.size > _FEW else "soon"
     verdicts, failed = _JUDGES[pace](kernel, stride, *still, np.int32(setting.next_turn()))
-    if not isinstance(failed, jax.core.Tracer):
+    if not isinstance(failed, Tracer):
         if not int(failed):
             return out
         flags = [np.asarray(flag) for flag in _flags(verdicts)]

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
+from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.auditing.problem import Problem
 from jaxgrasp.robustness.auditing.pyramids import CLOSED, MISSED, balanced, row_values
 from jaxgrasp.robustness.auditing.rows import own_inverse
-from jaxgrasp.solvers.conic_margin import ConicPoint, inner
+from jaxgrasp.solvers.conic_margin import ConicMargin, ConicPoint, inner
 
 
 class ChainVerdict(NamedTuple):
@@ -47,7 +48,7 @@ def admissible(problem: Problem, forces: jax.Array, exact: bool, cone_edges: int
 
 def disturbed_wrenches(problem: Problem, margins: jax.Array) -> jax.Array:
     """B - lambda W_j, (lanes, n_d, 6), for margins (lanes, n_d)."""
-    wrenches = jnp.moveaxis(problem.terms[0].wrenches, -1, 0)
+    wrenches = jnp.moveaxis(wrenches_of(problem.terms), -1, 0)
     finite = jnp.where(jnp.isfinite(margins), margins, 0)
     return problem.wrench[:, None] - finite[:, :, None] * wrenches
 
@@ -71,7 +72,7 @@ def all_hold(problem: Problem, forces: jax.Array, wrenches: jax.Array, check: tu
 def blocking_forces_stand(problem: Problem, changes: jax.Array, margin: jax.Array) -> jax.Array:
     """Whether changes (lanes, n_d, n, 3) are the blocking forces -lambda G* W_j with G* computed anew, (lanes,)."""
     inverse = own_inverse(problem)
-    wrenches = problem.terms[0].wrenches
+    wrenches = wrenches_of(problem.terms)
     finite = jnp.where(jnp.isfinite(margin), margin, 0)
     wanted = -jnp.einsum("kcl,dcl->ldk", inverse, jnp.broadcast_to(wrenches, (*wrenches.shape[:2], inverse.shape[-1])))
     wanted = finite[:, None, None, None] * wanted.reshape(changes.shape)
@@ -80,7 +81,7 @@ def blocking_forces_stand(problem: Problem, changes: jax.Array, margin: jax.Arra
     return (missed <= 10 * MISSED[changes.dtype.name] * size).all((1, 2))
 
 
-def proven_bounds(program: object, point: ConicPoint) -> jax.Array:
+def proven_bounds(program: ConicMargin, point: ConicPoint) -> jax.Array:
     """What the multipliers of conic programs prove about lambda, inf where nothing; (D, lanes).
 
     z in K, lambda (z'sigma + y'w) <= h'z + b'y - r'x with r = A'z + E'y, and |x| <= 1.

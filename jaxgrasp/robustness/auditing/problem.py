@@ -62,7 +62,7 @@ def problem_of(arguments: Arguments) -> Problem:
         name: jax.lax.stop_gradient(x[None] if arguments.shared[name] else x) for name, x in arguments.leaves.items()
     }
     present = leaves["active"]
-    here = lambda name, other: jnp.where(  # noqa: E731
+    here = lambda name, other: jnp.where(
         present.reshape(*present.shape, *[1] * (leaves[name].ndim - 2)), leaves[name], other
     )
     positions, friction, max_force = here("positions", 0), here("friction", 0), here("max_force", 1)
@@ -84,7 +84,7 @@ def problem_of(arguments: Arguments) -> Problem:
         wrench=leaves["wrench"],
         reserve=leaves["reserve"],
         terms=terms,
-        reach=sum(leaves[f"extent {i}"] for i in range(len(terms))),
+        reach=sum(leaves[f"extent {i}"] for i in range(len(terms))),  # pyright: ignore[reportArgumentType]  # no sum of none
         compliance=leaves.get("compliance"),
         per_vertex=leaves.get("per_vertex"),
         weights=leaves.get("weights"),
@@ -95,7 +95,7 @@ def problem_of(arguments: Arguments) -> Problem:
 
 
 def _hand(leaves: dict[str, jax.Array], jacobian: jax.Array, friction: jax.Array, max_force: jax.Array) -> Hand:
-    last = lambda x: jnp.moveaxis(x, 0, -1)  # noqa: E731
+    last = lambda x: jnp.moveaxis(x, 0, -1)
     limits = limited(
         Actuated(
             joints=jnp.moveaxis(jacobian, (3, 2, 1, 0), (0, 1, 2, 3)),

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold, fold_last
 from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import hidden
-from jaxgrasp.robustness.auditing.problem import Problem, facets, problem_of
+from jaxgrasp.robustness.auditing.problem import Hand, Problem, facets, problem_of
 from jaxgrasp.robustness.auditing.rows import Range, Rows, cross, own_rows
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers.status import Status
@@ -89,7 +89,8 @@ def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Ar
     apart = margin * jnp.maximum(_max(jnp.abs(rows.cone - used.cone)), jnp.abs(rows.bound - used.bound))
     right = _all((apart <= near * force) | ~there) & place.rank_stands
     if problem.hand is not None:
-        right &= (margin * jnp.abs(rows.effort - used.effort).max(1) <= near * effort_unit(problem)).all(-1)
+        assert rows.effort is not None and used.effort is not None
+        right &= (margin * jnp.abs(rows.effort - used.effort).max(1) <= near * effort_unit(problem.hand)).all(-1)
     # Where the set is said to reach outside, and neither multipliers nor contacts without friction bound the margin.
     proven = jnp.where(_slips(problem, used), 0, _upper_bound(problem, evidence, used)[0])
     unproven = proven > CLOSED[margin.dtype.name] * natural_scale(problem, used)
@@ -173,10 +174,11 @@ def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array
     parts += [_most(jnp.where(there, problem.max_force + slack - bound, jnp.inf), rows.bound)]
     holds = balanced(problem, forces)
     if problem.hand is not None:
-        efforts, slack = solution.actuator_efforts, missed * effort_unit(problem)
+        efforts, slack = solution.actuator_efforts, missed * effort_unit(problem.hand)
+        assert efforts is not None and rows.effort is not None
         spare = jnp.stack([problem.hand.upper + slack - efforts, efforts - problem.hand.lower + slack], 1)
         parts += [_most(spare, rows.effort)]
-        holds &= _driven(problem, forces, efforts)
+        holds &= _driven(problem.hand, forces, efforts)
     return holds, fold(jnp.minimum, parts)
 
 
@@ -212,15 +214,14 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
     return _max(jnp.abs(missing)) <= MISSED[f.dtype.name] * largest
 
 
-def effort_unit(problem: Problem) -> jax.Array:
+def effort_unit(hand: Hand) -> jax.Array:
     """The larger limit of every actuator, (lanes, n_u); a millionth of the largest where it is less, 0 for example."""
-    larger = jnp.maximum(jnp.abs(problem.hand.upper), jnp.abs(problem.hand.lower))
+    larger = jnp.maximum(jnp.abs(hand.upper), jnp.abs(hand.lower))
     return jnp.maximum(larger, 1e-6 * jnp.maximum(larger.max(-1, keepdims=True), 1e-6))
 
 
-def _driven(problem: Problem, forces: jax.Array, efforts: jax.Array) -> jax.Array:
+def _driven(hand: Hand, forces: jax.Array, efforts: jax.Array) -> jax.Array:
     """Whether J'f = B u, (lanes,)."""
-    hand = problem.hand
     given = jnp.einsum("liav,lia->lv", hand.jacobian, forces, precision="highest")
     taken = jnp.einsum("...vu,...u->...v", hand.transmission, efforts, precision="highest")
     largest = jnp.einsum("liav,lia->lv", jnp.abs(hand.jacobian), jnp.abs(forces)).max(-1)
@@ -255,8 +256,9 @@ def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.
     sound = (_min(cone, 2) >= 0) & (_min(bound) >= 0)
     value, more = _sum(problem.wrench * y), 0.0
     if problem.hand is not None:
-        more, held, spent = _of_efforts(problem, evidence, rows)
+        more, held, spent = _of_efforts(problem.hand, evidence, rows)
         pull, value = pull + held[0], value + held[1] + spent
+        assert evidence.actuator_multipliers is not None
         sound &= _min(evidence.actuator_multipliers, 2) >= 0
     each = bound * problem.max_force - total * problem.reserve[:, None] + _lost(problem, residual + more)
     value = value + _sum(jnp.where(problem.present, each, 0))
@@ -264,16 +266,16 @@ def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.
     return bound, sound & (value < 0)
 
 
-def _of_efforts(problem: Problem, evidence: Evidence | Solution, rows: Rows) -> tuple:
+def _of_efforts(hand: Hand, evidence: Evidence | Solution, rows: Rows) -> tuple:
     """What the multipliers of actuators and joints add: to r, (to z'sigma, to h'z), and the most that r_u'u can be."""
-    hand = problem.hand
-    z = evidence.actuator_multipliers
-    more = jnp.einsum("liav,lv->lia", hand.jacobian, evidence.joint_multipliers, precision="highest")
-    left = jnp.einsum("...vu,...v->...u", hand.transmission, evidence.joint_multipliers, precision="highest")
+    z, y = evidence.actuator_multipliers, evidence.joint_multipliers
+    assert z is not None and y is not None and rows.effort is not None
+    more = jnp.einsum("liav,lv->lia", hand.jacobian, y, precision="highest")
+    left = jnp.einsum("...vu,...v->...u", hand.transmission, y, precision="highest")
     residual = z[..., 0] - z[..., 1] - left
     pull = (z[..., 0] * rows.effort[:, 0] + z[..., 1] * rows.effort[:, 1]).sum(-1)
     value = (z[..., 0] * hand.upper - z[..., 1] * hand.lower).sum(-1)
-    return more, (pull, value), (jnp.abs(residual) * effort_unit(problem)).sum(-1)
+    return more, (pull, value), (jnp.abs(residual) * effort_unit(hand)).sum(-1)
 
 
 def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None) -> jax.Array:
@@ -313,10 +315,12 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     residual, total = _pulled(problem, cone, bound, y)
     held = bound * problem.max_force - total * problem.reserve[:, None]
     held = _sum(jnp.where(there, held, 0)) + _sum(problem.wrench * y)
+    assert asked is not None
     held -= asked * (_sum(cone * rows.cone, 2) + _sum(bound * rows.bound))
     if problem.hand is not None:
-        more, (pull, value), spent = _of_efforts(problem, solution, rows)
+        more, (pull, value), spent = _of_efforts(problem.hand, solution, rows)
         residual, held = residual + more, held + value + spent - pull * asked
+        assert solution.actuator_multipliers is not None
         sound &= _min(solution.actuator_multipliers, 2) >= 0
     if problem.weights is None:
         largest, weighed, answered = 1.0, forces, residual

@@ -17,6 +17,7 @@ from jax import lax
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
+from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.fence import fenced, fences
 from jaxgrasp.robustness.auditing.problem import Problem, facets
 
@@ -67,19 +68,19 @@ def own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, 
 def _own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, Range]:
     rows = fenced(_stacked_rows)(problem)
     # Where rows of the joints stand below those of G the solver does not tell their rank.
-    rank = rank if rows.shape[0] == 6 else None
-    plain = echelon(rows, rank)
+    told = rank if rows.shape[0] == 6 else None
+    plain = echelon(rows, told)
     if problem.per_vertex is None:
-        inverse = _weighted(rows, problem, problem.compliance, rank, plain)
+        inverse = _weighted(rows, problem, problem.compliance, told, plain)
         found = fenced(lambda problem, inverse: _reached(problem, inverse, cone_edges))(problem, inverse)
     else:
 
         def answered(vertex: tuple) -> Rows:
             matrices, wrench = vertex
-            inverse = _weighted(rows, problem, matrices, rank, plain)
+            inverse = _weighted(rows, problem, matrices, told, plain)
             return _reached(problem, inverse, cone_edges, wrench)
 
-        vertices = (jnp.moveaxis(problem.per_vertex, 1, 0), problem.terms[0].wrenches)
+        vertices = (jnp.moveaxis(problem.per_vertex, 1, 0), wrenches_of(problem.terms))
         found = jax.tree.map(lambda x: jnp.maximum(x.max(0), 0), lax.map(answered, vertices))
     return found, fenced(_range)(problem, plain)
 
