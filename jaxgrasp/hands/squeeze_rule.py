@@ -209,7 +209,7 @@ def _squeezes(hand: HandObject, given: Squeezable, closing: np.ndarray | None) -
     near = chosen.any(-1)
     if closing is not None:
         joints = np.where(near[:, None], joints, closing)
-    lost = ~given.known if closing is not None else ~(near & given.known)
+    lost = np.flatnonzero(~given.known if closing is not None else ~(near & given.known))
     joints[lost], controls[lost] = np.nan, np.nan
     margin, status = np.where(given.known, margin, np.nan), np.where(given.known, status, Status.INVALID_INPUT)
     points = np.einsum("nij,nkj->nki", given.object_rotation, given.positions) + given.object_position[:, None]

@@ -57,10 +57,10 @@ def write_movie(
     with offscreen(model, _PIXELS, _PIXELS) as render:
         for step in steps:
             panels = [
-                _panel(model, data, render, run.qpos[step, lane], run.push.at(time[step])[lane, :3], centre)
+                _panel(model, data, render, run.qpos[step, lane], run.push.at(float(time[step]))[lane, :3], centre)
                 for _, run, lane in runs
             ]
-            frames.append(_labelled(panels, [title for title, _, _ in runs], time[step]))
+            frames.append(_labelled(panels, [title for title, _, _ in runs], float(time[step])))
     _write(path, frames)
 
 
