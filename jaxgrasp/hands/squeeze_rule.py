@@ -206,7 +206,7 @@ def _squeezes(hand: HandObject, given: Squeezable, closing: np.ndarray | None) -
     chosen, forces, margin, status = _forces(hand, given)
     forces = _scales(hand, given, forces)[:, None, None] * forces
     joints, controls = pressed(hand, given, forces)
-    near = chosen.any(-1)
+    near = np.asarray(np.any(chosen, -1))
     if closing is not None:
         joints = np.where(near[:, None], joints, closing)
     lost = np.flatnonzero(~given.known if closing is not None else ~(near & given.known))
