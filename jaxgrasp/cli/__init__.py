@@ -3,7 +3,8 @@
 This file answers signals until `signals` does, and is all that is imported before: it imports what Python itself has.
 """
 
-import _signal  # `signal` also imports `enum`, which takes four milliseconds.
+# `signal` also imports `enum`, which takes four milliseconds. Python's stubs lack this one.
+import _signal  # pyright: ignore[reportMissingImports]
 import os
 
 

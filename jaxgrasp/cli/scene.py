@@ -191,6 +191,8 @@ class GivenScene(HandScene):
         Raises:
             OSError: The picture cannot be made or written.
         """
+        import jax.numpy as jnp
+
         from jaxgrasp.viewer.scene import draw_scenes
 
         columns = ranking.candidates.columns
@@ -204,7 +206,7 @@ class GivenScene(HandScene):
         kept = ranking.forces.shape[1]
         forces = np.zeros((len(best), *grasps.contacts.positions.shape[1:]))
         forces[:, :kept] = ranking.forces[best][:, : forces.shape[1]]
-        points, forces = (np.asarray(x) for x in grasps.in_world_frame(forces))
+        points, forces = (np.asarray(x) for x in grasps.in_world_frame(jnp.asarray(forces)))
         titles = [f"#{b + 1}: margin {ranking.margin[row]:.3g} {unit}" for b, row in zip(best, rows, strict=True)]
         try:
             draw_scenes(path, hand.model, qpos, points, forces, titles, hand.object_body)

@@ -46,7 +46,9 @@ def configure_jax() -> None:
 
     jax.config.update("jax_enable_x64", True)
     folder = _folder_of_programs()
-    if folder is not None and jax.config.jax_compilation_cache_dir is None:
+    # JAX gives its configuration the options while it is imported: no stub has them.
+    kept = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder is not None and kept is None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     try:

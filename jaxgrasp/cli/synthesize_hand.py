@@ -147,7 +147,7 @@ class SceneSynthesis(HandScene):
             with atomic_write(path) as stream:
                 np.savez(
                     stream,
-                    **columns(kept),
+                    **columns(kept),  # pyright: ignore[reportArgumentType]  # no column is called allow_pickle
                     squeeze_controls=kept.controls,
                     synthesis_margin=kept.margin,
                     self_penetration=kept.self_penetration,

@@ -304,7 +304,7 @@ def _evaluation(
     said: list[str],
     interrupted: bool,
 ) -> Evaluation:
-    array = lambda values, kind="float": np.array(list(values), np.dtype(kind))  # noqa: E731
+    array = lambda values, kind="float": np.array(list(values), np.dtype(kind))
     return Evaluation(
         protocol=protocol,
         grasps=grasps,

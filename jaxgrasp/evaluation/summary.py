@@ -81,7 +81,7 @@ def diversity(grasps: GraspSet) -> Float[np.ndarray, " components"]:
 
 def _summary(found: Evaluation, name: str, chosen: np.ndarray) -> Summary:
     tried, held = int(found.tried[chosen].sum()), int(found.held[chosen].sum())
-    mean = lambda values: float(np.nanmean(values[chosen])) if np.isfinite(values[chosen]).any() else math.nan  # noqa: E731
+    mean = lambda values: float(np.nanmean(values[chosen])) if np.isfinite(values[chosen]).any() else math.nan
     known = chosen & (found.outcome != UNUSABLE)
     return Summary(
         name=name,

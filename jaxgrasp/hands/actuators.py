@@ -75,9 +75,9 @@ def read_actuators(model: mujoco.MjModel, dofs: np.ndarray) -> Actuators:
     numbers = np.flatnonzero(acts[:, dofs].any(-1))
     on_tendon = model.actuator_trntype[numbers] == int(mujoco.mjtTrn.mjTRN_TENDON)
     constant = all(is_fixed(model, t) for t in model.actuator_trnid[numbers[on_tendon], 0])
-    affine = np.array([_affine(model, a) for a in numbers]).reshape(-1, 3)
+    affine = np.array([_affine(model, a) for a in numbers.tolist()]).reshape(-1, 3)
     unlimited = np.array([-np.inf, np.inf])
-    limited = lambda flags, ranges: np.where(flags[numbers, None], ranges[numbers], unlimited)  # noqa: E731
+    limited = lambda flags, ranges: np.where(flags[numbers, None], ranges[numbers], unlimited)
     command = limited(model.actuator_ctrllimited, model.actuator_ctrlrange)
     for row, a in enumerate(numbers):
         if model.actuator_dyntype[a] == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):
@@ -145,7 +145,7 @@ def moved_by_tendon(model: mujoco.MjModel, tendon: int) -> np.ndarray:
         if kind != int(mujoco.mjtWrap.mjWRAP_PULLEY)
     }
     moved = np.array([moved_by(model, body) for body in bodies])
-    return moved.any(0) & ~moved.all(0)
+    return np.asarray(moved.any(0) & ~moved.all(0))
 
 
 def moved_by(model: mujoco.MjModel, body: int) -> np.ndarray:

@@ -53,7 +53,7 @@ class Couplings:
                     continue
                 at = joints[..., leader] - float(reference)
                 slope = sum(float(c) * at**power for power, c in enumerate(coefficients))
-                rows[follower] = slope[..., None] * rows[leader]
+                rows[follower] = slope[..., None] * rows[leader]  # pyright: ignore[reportIndexIssue]  # no sum of none
         return xp.stack(rows, -2)[..., self.free]
 
 

@@ -10,6 +10,7 @@
 from typing import Any, NamedTuple, Protocol
 
 import jax
+from jax.core import Tracer
 
 from jaxgrasp.hands.link_contacts import RawPoints
 
@@ -62,7 +63,7 @@ def engine_for(given: str | None, qpos: Any) -> str:
     Raises:
         ValueError: There is no such engine, or it cannot answer while JAX traces.
     """
-    traced = isinstance(qpos, jax.core.Tracer)
+    traced = isinstance(qpos, Tracer)
     if given is None:
         return "distance" if traced or jax.default_backend() != "cpu" else "mujoco"
     if given not in ENGINES:

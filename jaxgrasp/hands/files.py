@@ -43,9 +43,15 @@ def compile_file(path: str | os.PathLike) -> mujoco.MjModel:
         model = Path(folder, "model.mjb")
         limits = [str(allowance() // _SHARE + _OWN), str(max(1, round(_SECONDS * allowance() / 2**30)))]
         command = [sys.executable, "-P", str(Path(__file__).with_name("compiler.py")), str(path.absolute()), str(model)]
-        streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
         try:
-            child = subprocess.run([*command, *limits], cwd=folder, timeout=_PATIENCE, **streams)
+            child = subprocess.run(
+                [*command, *limits],
+                cwd=folder,
+                timeout=_PATIENCE,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
         except subprocess.TimeoutExpired as error:
             raise FileError(path, None, f"a model that takes more than {_PATIENCE:g} s to compile", _WANTED) from error
         if child.returncode == 0:

@@ -118,10 +118,14 @@ def _repositories(package: Path) -> dict[str, str]:
         for node in ast.walk(_parsed(file))
         if isinstance(node, ast.Dict)
         for key, value in zip(node.keys, node.values, strict=True)
-        if isinstance(key, ast.Constant) and isinstance(value, ast.Call)
+        if isinstance(key, ast.Constant) and isinstance(key.value, str) and isinstance(value, ast.Call)
     }
     folders = {name: words.get("cache_path") for name, words in calls.items()}
-    found = {name: str(_cache() / x.value) for name, x in folders.items() if isinstance(x, ast.Constant)}
+    found = {
+        name: str(_cache() / x.value)
+        for name, x in folders.items()
+        if isinstance(x, ast.Constant) and isinstance(x.value, str)
+    }
     menagerie = os.environ.get(_MENAGERIE)
     return found | ({"mujoco_menagerie": menagerie} if menagerie else {})
 
@@ -130,11 +134,11 @@ def _assigned(file: Path, repositories: Mapping[str, str]) -> dict[str, str]:
     """The paths that a module assigns to names, as far as they are joined of names and strings."""
     values: dict[str, str] = {}
     for node in _parsed(file).body:
-        targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
-        if len(targets) == 1 and isinstance(targets[0], ast.Name):
-            value = _value(node.value, values, repositories)
-            if value is not None:
-                values[targets[0].id] = value
+        match node:
+            case ast.AnnAssign(target=ast.Name(id=name), value=given) | ast.Assign([ast.Name(id=name)], value=given):
+                value = _value(given, values, repositories)
+                if value is not None:
+                    values[name] = value
     return values
 
 
@@ -145,8 +149,9 @@ def _value(node: ast.expr | None, values: Mapping[str, str], repositories: Mappi
         return values.get(node.id)
     if not isinstance(node, ast.Call):
         return None
-    parts = [_value(argument, values, repositories) for argument in node.args]
-    if not parts or None in parts:
+    found = [_value(argument, values, repositories) for argument in node.args]
+    parts = [part for part in found if part is not None]
+    if not parts or len(parts) < len(found):
         return None
     if isinstance(node.func, ast.Name) and node.func.id.endswith("clone_to_cache"):
         return repositories.get(parts[0])

@@ -122,10 +122,8 @@ class HandObject:
         of_object = bodies_below(model, body)
         if np.any(model.body_jntnum[of_object[1:]]):
             raise ValueError(f"object_body: got {object_body!r}, with joints inside; wanted a rigid object")
-        if hand_body is None:
-            hand = hand_bodies(model, of_object)
-        else:
-            hand = bodies_below(model, body_named(model, "hand_body", hand_body))
+        first = None if hand_body is None else body_named(model, "hand_body", hand_body)
+        hand = hand_bodies(model, of_object) if first is None else bodies_below(model, first)
         for name in environment:
             hand = np.setdiff1d(hand, bodies_below(model, body_named(model, "environment", name)))
         hand = np.setdiff1d(hand, of_object)
@@ -200,8 +198,7 @@ class HandObject:
 
         Derivatives:
             With engine "distance", of everything but `links` and counts with respect to qpos; kinks where the nearest
-            features of two geoms change. Stops of joints do not count there: what they bear jumps where they are
-            reached.
+            features of two geoms change. Stops of joints do not count there: what they bear jumps.
         """
         name = engine_for(engine, qpos)
         finder = self.engine(name)
@@ -226,6 +223,8 @@ class HandObject:
             grasps: Of the configurations.
             efforts: (*batch, n_u), of `grasps.actuation`, N or N m.
         """
+        if grasps.spring_efforts is None:
+            raise ValueError("grasps: got some without their actuation; wanted actuation=True")
         efforts = as_float("efforts", efforts, (grasps.spring_efforts.shape[-1],))
         return (efforts - grasps.spring_efforts)[..., : len(self._actuators.numbers)]
 
@@ -260,21 +259,19 @@ class HandObject:
         Raises:
             ValueError: An actuator without stiffness, a motor for example.
         """
-        if grasps.actuation is None:
+        if grasps.actuation is None or grasps.joint_stiffness is None:
             raise ValueError("compliance: nothing acts on the hand; wanted actuators")
-        soft = self._actuators.slope >= 0
-        if soft.any():
-            names = ", ".join(repr(n) for n, s in zip(self.actuator_names, soft, strict=True) if s)
-            raise ValueError(f"compliance: actuators {names} have no stiffness; wanted position servos")
+        soft = [repr(n) for n, s in zip(self.actuator_names, self._actuators.slope, strict=True) if s >= 0]
+        if soft:
+            raise ValueError(f"compliance: actuators {', '.join(soft)} have no stiffness; wanted position servos")
         stiffness = as_float("tip_stiffness", tip_stiffness, ())
         jacobian = grasps.actuation.jacobian
         flexible = jnp.linalg.pinv(grasps.joint_stiffness, rtol=1e-9)
         tall = jacobian.reshape(*jacobian.shape[:-3], 3 * jacobian.shape[-3], jacobian.shape[-1])
         tips = jnp.broadcast_to(1 / stiffness, jacobian.shape[:-2]) if stiffness.ndim == 0 else 1 / stiffness
         tips = jnp.broadcast_to(jnp.repeat(tips, 3, -1), tall.shape[:-1])
-        return tall @ flexible @ jnp.swapaxes(tall, -1, -2) + tips[..., None] * jnp.eye(
-            tall.shape[-2], dtype=tall.dtype
-        )
+        reached = tall @ flexible @ jnp.swapaxes(tall, -1, -2)
+        return reached + tips[..., None] * jnp.eye(tall.shape[-2], dtype=tall.dtype)
 
     @property
     def slot_links(self) -> np.ndarray:
@@ -322,8 +319,9 @@ class HandObject:
             self._programs[key] = compiled(partial(self._in_tiles, self.engine(name), actuation))
         return self._programs[key]
 
-    def _in_tiles(self, engine: DistanceEngine | MjxEngine, actuation: bool, qpos: jax.Array) -> HandGrasps:
+    def _in_tiles(self, engine: Engine, actuation: bool, qpos: jax.Array) -> HandGrasps:
         """On CPUs, tiles that stay in the cache; and searches among their lanes do not wait for the slowest of all."""
+        assert isinstance(engine, DistanceEngine | MjxEngine)
         count, size = len(qpos), engine.tile
         if count <= size or jax.default_backend() != "cpu":
             return self._found(engine, actuation, qpos, jnp)
@@ -339,7 +337,7 @@ class HandObject:
         geometry = engine.find(safe)
         found = self.rule.contacts(geometry.points, self.touching_links, xp)
         rotation, centre = geometry.object_rotation, geometry.object_position
-        in_object = lambda x: xp.einsum("nji,ncj->nci", rotation, x)  # noqa: E731
+        in_object = lambda x: xp.einsum("nji,ncj->nci", rotation, x)
         # A grasp that is not admissible has one contact that is not, either.
         position = xp.where(admissible[:, None, None], in_object(found.position - centre[:, None]), np.nan)
         contacts = Contacts.from_frames(
@@ -356,7 +354,7 @@ class HandObject:
             joints = safe[:, self.model.jnt_qposadr[self.joints]]
             mechanics = self._mechanics.actuation(geometry, joints, jacobian, not engine.differentiable, xp)
         weight = wrench_against_weight(self.model, bodies_below(self.model, self.object_body), rotation, xp)
-        as_float_array = lambda x: jnp.asarray(x, jnp.result_type(float) if xp is np else qpos.dtype)  # noqa: E731
+        as_float_array = lambda x: jnp.asarray(x, jnp.result_type(float) if xp is np else qpos.dtype)
         return HandGrasps(
             contacts=contacts,
             distances=as_float_array(found.distance),
@@ -380,7 +378,9 @@ class HandObject:
 
     @cached_property
     def _distances(self) -> DistanceEngine:
-        return self.engine("distance")
+        engine = self.engine("distance")
+        assert isinstance(engine, DistanceEngine)
+        return engine
 
     @property
     def kinematics(self) -> Kinematics:

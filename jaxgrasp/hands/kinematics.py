@@ -85,8 +85,8 @@ class Kinematics:
                     if joint >= 0:
                         anchors[int(joint)], axes[int(joint)] = (x[:, body] for x in found[slot])
         none = jnp.zeros((3, *lanes), dtype)
-        stack = lambda parts: jnp.stack([parts.get(j, none) for j in range(self._model.njnt)], 1)  # noqa: E731
-        together = lambda parts, axis: jnp.take(jnp.concatenate(parts, axis), self._place, axis)  # noqa: E731
+        stack = lambda parts: jnp.stack([parts.get(j, none) for j in range(self._model.njnt)], 1)
+        together = lambda parts, axis: jnp.take(jnp.concatenate(parts, axis), self._place, axis)
         return Poses(together(rotations, 2), together(positions, 1), stack(anchors), stack(axes))
 
     def _step(self, level: _Level, rotation: jax.Array, position: jax.Array, qpos: jax.Array) -> tuple:

@@ -84,8 +84,8 @@ class ContactRule:
         found = [_of_link(raw, int(link), self.points_per_link, xp) for link in links]
         stacked = LinkContacts(*(xp.stack(parts, 1) for parts in zip(*found, strict=True)))
         kept = _kept(stacked, _order(stacked.distance.min(-1), xp)[:, : self.max_contacts], xp)
-        flat = lambda x: x.reshape(x.shape[0], -1, *x.shape[3:])  # noqa: E731
-        return LinkContacts(*map(flat, kept[:-2]), kept.touching, kept.left_out)
+        flat = lambda x: x.reshape(x.shape[0], -1, *x.shape[3:])
+        return LinkContacts._make([*map(flat, kept[:-2]), kept.touching, kept.left_out])
 
 
 def _kept(contacts: LinkContacts, chosen: Array, xp: ModuleType) -> LinkContacts:
@@ -95,7 +95,7 @@ def _kept(contacts: LinkContacts, chosen: Array, xp: ModuleType) -> LinkContacts
     order = _picked(chosen, _order(_picked(distance, chosen, xp), xp), xp)
     kept = [_picked(x, order, xp) for x in contacts[:-2]]
     counts = [(x.any(-1) if x.ndim == 3 else x).sum(-1) for x in (contacts.active, kept[-1])]
-    return LinkContacts(*kept, counts[0], counts[0] - counts[1])
+    return LinkContacts._make([*kept, counts[0], counts[0] - counts[1]])
 
 
 def _in_turn(points: LinkContacts, links: np.ndarray, xp: ModuleType) -> Array:

@@ -82,7 +82,7 @@ class Mechanics:
         ends = np.isfinite(passive.limits).any(-1)
         reached = self._through(np.concatenate([moments, np.eye(len(joints))[:, rough]], -1), joints, model)
         spring = np.flatnonzero(passive.sprung)
-        spans = lambda d: _spans(reached, self._through(np.eye(len(joints))[:, [d]], joints, model))  # noqa: E731
+        spans = lambda d: _spans(reached, self._through(np.eye(len(joints))[:, [d]], joints, model))
         idle = [d for d in spring if not spans(d)]
         leaning = np.flatnonzero(ends & ~rough & ~(self._own != 0).any(-1))
         self._columns = _Columns(
@@ -153,9 +153,9 @@ class Mechanics:
         through = whole[..., : len(self._actuators.numbers)].astype(dtype)
         servo = np.maximum(-self._actuators.slope, 0).astype(dtype)
         stiffness = (through * servo) @ xp.swapaxes(through, -1, -2) + stiffness
-        turn = lambda matrix, vectors: (matrix @ vectors[..., None])[..., 0]  # noqa: E731
-        as_array = lambda x: jnp.asarray(x, jnp.result_type(float) if xp is np else dtype)  # noqa: E731
-        spread = lambda x: as_array(xp.broadcast_to(x, (len(joints), *x.shape[-2:])))  # noqa: E731
+        turn = lambda matrix, vectors: (matrix @ vectors[..., None])[..., 0]
+        as_array = lambda x: jnp.asarray(x, jnp.result_type(float) if xp is np else dtype)
+        spread = lambda x: as_array(xp.broadcast_to(x, (len(joints), *x.shape[-2:])))
         found = {"spring_torques": as_array(turn(back, geometry.springs)), "joint_stiffness": spread(stiffness)}
         if not whole.shape[-1] or not whole.shape[-2]:
             return found | {"actuation": None, "spring_efforts": as_array(xp.zeros((len(joints), 0), dtype))}

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.core import eval_jaxpr
 from jax.interpreters import partial_eval
 
 from jaxgrasp.hands.actuators import Actuators
@@ -140,7 +141,7 @@ class MjxEngine:
             # What is left without all that does not make these numbers takes no compiler.
             bare, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
             inputs = [x for x, needed in zip(jax.tree.leaves(data), used, strict=True) if needed]
-            geoms = np.asarray(jax.core.eval_jaxpr(bare, traced.consts, *inputs)[0])
+            geoms = np.asarray(eval_jaxpr(bare, traced.consts, *inputs)[0])
         first_is_object = np.isin(self._model.geom_bodyid[geoms[:, 0]], self._object)
         pairs = np.where(first_is_object[:, None], geoms[:, ::-1], geoms)
         # Pairs that are spelt out are found, too, where they are none of hand and object.

@@ -69,7 +69,7 @@ def _capsules(a: Geom, b: Geom) -> jax.Array:
 
 
 def _capsule_and_box(a: Geom, b: Geom) -> jax.Array:
-    turned = lambda vector: fold(jnp.add, [b.rotation[i] * vector[i] for i in range(3)])  # noqa: E731
+    turned = lambda vector: fold(jnp.add, [b.rotation[i] * vector[i] for i in range(3)])
     centre, half = turned(a.position - b.position), turned(a.rotation[:, 2] * a.size[1])
 
     def distance(at: jax.Array, centre: jax.Array, half: jax.Array) -> jax.Array:
@@ -179,5 +179,5 @@ def _part(model: mujoco.MjModel, geom: int) -> tuple[str, tuple[float, float, fl
 def _neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
     """Whether at most one joint is between two bodies."""
     a, b = int(model.body_weldid[a]), int(model.body_weldid[b])
-    above = lambda body: int(model.body_weldid[model.body_parentid[body]])  # noqa: E731
+    above = lambda body: int(model.body_weldid[model.body_parentid[body]])
     return a == b or above(a) == b or above(b) == a

@@ -135,7 +135,7 @@ def squeezable(hand: HandObject, qpos: Float[np.ndarray, "n nq"], grasps: HandGr
     following = hand.couplings.velocities(joints, np)
     shift = np.asarray(grasps.spring_efforts)[:, : len(own.numbers)]
     lower, upper = (side[:, : len(own.numbers)] - shift for side in (actuation.lower, actuation.upper))
-    inside = lambda x: np.where(known.reshape(-1, *[1] * (x.ndim - 1)), x, 0)  # noqa: E731
+    inside = lambda x: np.where(known.reshape(-1, *[1] * (x.ndim - 1)), x, 0)
     return Squeezable(
         positions=inside(contacts.positions),
         frames=np.where(active[..., None, None], contacts.frames, np.eye(3)),
@@ -252,7 +252,7 @@ def pressed(
     effort = effort + np.sign(effort) * np.minimum(np.abs(effort), given.dry)
     lengths = np.where(servo, way + effort / np.where(servo, -hand._actuators.slope, 1), 0)
     joints = np.einsum("njv,nvu,nu->nj", given.following, back, lengths)
-    command = lambda force, at: np.asarray(hand._actuators.command_for(jnp.asarray(force), jnp.asarray(at)))  # noqa: E731
+    command = lambda force, at: np.asarray(hand._actuators.command_for(jnp.asarray(force), jnp.asarray(at)))
     controls = np.where(servo, command(0 * effort, given.lengths + lengths), command(effort, given.lengths))
     return joints, controls
 

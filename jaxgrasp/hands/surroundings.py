@@ -189,7 +189,7 @@ class Surroundings:
         """Of the surfaces of geoms in the reference configuration; points and normals (n, 3), world frame."""
         model, data = self.hand.model, self._reference
         lanes = jnp.asarray(points, float).T
-        spread = lambda x: jnp.broadcast_to(jnp.asarray(x)[..., None], (*x.shape, lanes.shape[1]))  # noqa: E731
+        spread = lambda x: jnp.broadcast_to(jnp.asarray(x)[..., None], (*x.shape, lanes.shape[1]))
         own = Geom(lanes, spread(np.eye(3)), jnp.zeros_like(lanes))
         found = []
         for geom in geoms:
@@ -222,7 +222,7 @@ def _outermost(hand: HandObject) -> np.ndarray:
     """The outermost body of every finger that can touch."""
     model, moved = hand.model, hand.moved_bodies
     can = np.unique(hand.slot_links[moved[hand.slot_links].any(-1)])
-    below = lambda body: np.intersect1d(bodies_below(model, body), can)  # noqa: E731
+    below = lambda body: np.intersect1d(bodies_below(model, body), can)
     return np.array([body for body in can if len(below(int(body))) == 1], int)
 
 

@@ -82,8 +82,9 @@ def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> P
     used = np.unique([pair for pairs in found.values() for pair in pairs])
     for (kinds, meshes), pairs in found.items():
         geoms = np.array(pairs)
-        hulls = tuple(None if m < 0 else hull_of(model, m) for m in meshes)
-        groups.append(Group(kinds, *np.searchsorted(used, geoms).T, hulls))
+        of_hand, of_object = np.searchsorted(used, geoms).T
+        hulls = [None if m < 0 else hull_of(model, m) for m in meshes]
+        groups.append(Group(kinds, of_hand, of_object, (hulls[0], hulls[1])))
         count = slots(*kinds)
         link.append(np.tile(model.geom_bodyid[geoms[:, 0]], count))
         mu.append(np.tile([known[pair].friction for pair in pairs], count))
@@ -131,16 +132,17 @@ def _geoms(table: PairTable, positions: jax.Array, rotations: jax.Array, geoms: 
 
 
 def _kinds(model: mujoco.MjModel, hand: int, object: int) -> tuple[str, str]:
-    kinds = tuple(KIND.get(mujoco.mjtGeom(model.geom_type[g])) for g in (hand, object))
+    # Of a kind that has no name here there is no pair.
+    one, other = (KIND.get(mujoco.mjtGeom(model.geom_type[g]), "") for g in (hand, object))
     try:
-        slots(*kinds)
+        slots(one, other)
     except (ValueError, KeyError):
         names = [f"{_name(model, g)} ({mujoco.mjtGeom(model.geom_type[g]).name[7:].lower()})" for g in (hand, object)]
         raise ValueError(
             f"scene: geoms {names[0]} and {names[1]} can touch, but no distance is known between their kinds; "
             f"wanted {', '.join(KIND.values())}, contype and conaffinity that keep them apart, or engine 'mujoco'"
         ) from None
-    return kinds
+    return one, other
 
 
 def _name(model: mujoco.MjModel, geom: int) -> str:

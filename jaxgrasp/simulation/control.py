@@ -16,6 +16,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.contact.friction import pyramid_facets
@@ -35,11 +36,11 @@ _EDGES = 8
 class Wanted(NamedTuple):
     """Of the object; lanes lead, world frame."""
 
-    position: Float[Array, "lanes 3"]
-    rotation: Float[Array, "lanes 3 3"]
-    velocity: Float[Array, "lanes 6"]
+    position: Float[Array | np.ndarray, "lanes 3"]
+    rotation: Float[Array | np.ndarray, "lanes 3 3"]
+    velocity: Float[Array | np.ndarray, "lanes 6"]
     """Of the centre of mass, linear m/s and angular rad/s."""
-    acceleration: Float[Array, "lanes 6"]
+    acceleration: Float[Array | np.ndarray, "lanes 6"]
 
 
 class Impedance(NamedTuple):
@@ -91,7 +92,7 @@ def goal_of(
     """
     back = jnp.swapaxes(state.rotation, -1, -2)
 
-    def inward(twist: jax.Array) -> jax.Array:
+    def inward(twist: jax.Array | np.ndarray) -> jax.Array:
         return jnp.einsum("nij,nkj->nki", back, twist.reshape(-1, 2, 3)).reshape(-1, 6)
 
     turn = back @ wanted.rotation
@@ -102,8 +103,8 @@ def goal_of(
     drive = 2 * impedance.damping * rate * (twist - state.twist) + rate**2 * error
     carried = jnp.einsum("nwa,na->nw", state.grasp_map, jnp.einsum("nwa,nw->na", state.grasp_map, drive))
     follow = _follow(state)
-    along = lambda twist: jnp.einsum("nvw,nw->nv", follow, twist)  # noqa: E731
-    inertial = lambda q: jnp.einsum("nvw,nw->nv", state.joint_inertia, q)  # noqa: E731
+    along = lambda twist: jnp.einsum("nvw,nw->nv", follow, twist)
+    inertial = lambda q: jnp.einsum("nvw,nw->nv", state.joint_inertia, q)
     homeward = 2 * impedance.damping * rate * (along(twist) - state.joint_velocity) + rate**2 * (posture - state.joints)
     goal = Goal(
         wrench=(acceleration + drive) @ state.inertia + state.weight + _FINGER_MASS * carried,
@@ -134,7 +135,7 @@ def _blocking(state: State, wrench: Array, compliance: Array | None) -> Float[Ar
     return (softened @ _solve(gram, (_SCALE * wrench)[..., None]))[..., 0]
 
 
-def _solve(matrix: Array, right: Array) -> Array:
+def _solve(matrix: ArrayLike, right: ArrayLike) -> Array:
     """For positive definite matrices."""
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix, symmetrize_input=False), True), right)
 

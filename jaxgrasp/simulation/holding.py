@@ -174,6 +174,7 @@ def _idle_commands(hand: HandObject, qpos: np.ndarray) -> tuple[np.ndarray, np.n
         # The last tile is filled up, so that one compilation serves all.
         rows = np.arange(first, first + _TILE) % len(qpos)
         grasps = hand.grasps(qpos[rows])
+        assert grasps.spring_efforts is not None
         # Neither the actuators nor what joints bear by themselves, dry friction for example, exert anything.
         idle.append(np.asarray(hand.controls(grasps, np.zeros(grasps.spring_efforts.shape))))
         known.append(np.isfinite(np.asarray(grasps.required_wrench)).all(-1))

@@ -47,7 +47,8 @@ class State(NamedTuple):
 def by_finger(grasps: HandGrasps) -> HandGrasps:
     """Grasps (n,) with the contacts in the order of the links that they are on."""
     order = jnp.argsort(grasps.links, -1)
-    pick = lambda x: jnp.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - 2)), 1)  # noqa: E731
+    pick = lambda x: jnp.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - 2)), 1)
+    assert grasps.actuation is not None
     return replace(
         grasps,
         contacts=jax.tree.map(pick, grasps.contacts),
@@ -75,6 +76,7 @@ def measure(
     reach = engaged & (grasps.distances <= _REACH)
     maps = grasp_map(replace(grasps.contacts, active=reach))
     whole = grasp_map(replace(grasps.contacts, active=jnp.ones_like(reach)))
+    assert grasps.actuation is not None
     jacobian = grasps.actuation.jacobian.reshape(len(qpos), -1, len(hand.joints))
     start = int(hand.model.body_dofadr[hand.object_body])
     linear = jnp.einsum("nji,nj->ni", grasps.object_rotation, qvel[:, start : start + 3])

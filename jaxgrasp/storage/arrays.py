@@ -94,7 +94,7 @@ class Archive:
         return {name: self._read(name) for name in names}
 
     def _check_cost(self, names: tuple[str, ...]) -> None:
-        headers, members = ([table[name] for name in names] for table in (self.headers, self._members))
+        headers, members = [self.headers[name] for name in names], [self._members[name] for name in names]
         largest = max(names, key=lambda name: self.headers[name].cost, default=None)
         _check_cost(self._path, largest, sum(header.cost for header in headers))
         inflated, stored = (sum(getattr(m, which) for m in members) for which in ("file_size", "compress_size"))

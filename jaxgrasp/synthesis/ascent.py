@@ -7,7 +7,7 @@ margin: what is found with one is a lower bound of what holds without.
 
 import functools
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -162,6 +162,8 @@ def _step(state: State, task: Task, number: Array, key: PRNGKeyArray, cone_edges
     # Optax raises floats to integer powers, which users of strict promotion have forbidden.
     with jax.numpy_dtype_promotion("standard"):
         direction, momentum = jax.vmap(_ADAM.update)(slope, state.momentum)
+    # Optax's updates are any tree; Adam's have the form of the slope.
+    direction = cast(Array, direction)
     length = task.size * (_LAST_STEP + _FIRST_STEP * 0.5 * (1 + jnp.cos(jnp.pi * done)))
     move = length * direction
     move = move - outward * jnp.sum(move * outward, -1, keepdims=True)

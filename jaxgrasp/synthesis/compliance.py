@@ -8,7 +8,7 @@ Q = diag(exp(-u)) with u of mean 0, by ascent along the gradient of the margin.
 import functools
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -133,7 +133,8 @@ def _ascend(
         # Optax raises floats to integer powers, which users of strict promotion have forbidden.
         with jax.numpy_dtype_promotion("standard"):
             updates, momenta = optimizer.update(slopes, state.momenta)
-        u = optax.apply_updates(state.u, updates)
+        # Optax's parameters are any tree; these are one array.
+        u = cast(jax.Array, optax.apply_updates(state.u, updates))
         mean = jnp.mean(u, (-2, -1), keepdims=True, where=present)
         return _State(jnp.clip(jnp.where(present, u - mean, 0), -bound, bound), momenta, best, best_u), margin
 

@@ -8,7 +8,7 @@ and for links that are not there yet; both fade.
 
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +105,8 @@ def _step(state: State, task: Task, number: Array, around: Surroundings, torque_
     # Optax raises floats to integer powers, which users of strict promotion have forbidden.
     with jax.numpy_dtype_promotion("standard"):
         direction, momentum = jax.vmap(_ADAM.update)(slope, state.momentum)
+    # Optax's updates are any tree; Adam's have the form of the slope.
+    direction = cast(Array, direction)
     length = _LAST_STEP + _FIRST_STEP * 0.5 * (1 + jnp.cos(jnp.pi * done))
     return State(qpos=retracted(around, state.qpos, -length * units * direction), momentum=momentum), found
 

@@ -93,7 +93,7 @@ def terms_of(
         torque_limits: Whether the margin is what the actuators can produce.
     """
     near, hand = around.near(qpos), around.hand
-    inward = lambda vectors: jnp.einsum("nji,n...j->n...i", near.object_rotation, vectors)  # noqa: E731
+    inward = lambda vectors: jnp.einsum("nji,n...j->n...i", near.object_rotation, vectors)
     share = jnp.exp(-((near.distance / touch_length) ** 2))
     contacts = Contacts.from_normals(
         inward(near.position - near.object_position[:, None]),

@@ -59,7 +59,7 @@ def figure_of_ranking(
     for number, place in enumerate(shown, start=1):
         # Added one by one: matplotlib cannot lay out a 3D panel that is there and not visible.
         panel = right.add_subplot(-(-len(shown) // columns), columns, number, projection="3d", proj_type="ortho")
-        _draw_panel(panel, ranking, place, unit, loaded, held and held(ranking.order[place]))
+        _draw_panel(panel, ranking, place, unit, loaded, held and held(int(ranking.order[place])))
     right.legend(handles=_legend(loaded), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return figure
 

@@ -32,7 +32,7 @@ def held_by(hand: HandObject, qpos: Float[np.ndarray, " nq"], engine: str | None
         collide = np.isin(model.geom_bodyid, bodies) & ((model.geom_contype | model.geom_conaffinity) != 0)
         collide[np.concatenate([model.pair_geom1, model.pair_geom2])] = True
         parts = []
-        for geom in np.flatnonzero(collide & np.isin(model.geom_bodyid, bodies)):
+        for geom in np.flatnonzero(collide & np.isin(model.geom_bodyid, bodies)).tolist():
             world = triangles_of(model, geom) @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
             parts.append((world - middle) @ turn)
         return parts

@@ -78,7 +78,7 @@ def _draw_ascent(axes: Axes, found: "Synthesis", unit: str) -> None:
 
 def _draw_distribution(axes: Axes, found: "Synthesis", unit: str) -> None:
     before, after = (np.maximum(np.nan_to_num(margin, nan=0.0), 0.0) for margin in (found.first_margin, found.margin))
-    edges = np.linspace(0.0, max(float(after.max()), float(before.max()), 1e-9), 41)
+    edges = np.linspace(0.0, max(float(after.max()), float(before.max()), 1e-9), 41).tolist()
     axes.hist(before, bins=edges, color="0.75", label="random starts")
     axes.hist(after, bins=edges, color="#4477aa", alpha=0.8, label="synthesised")
     axes.set(xlabel=f"robustness margin $\\lambda$ [{unit}]", ylabel="grasps", yscale="log")
