@@ -1,4 +1,4 @@
-"""How long a ranking of grasp files takes, from command to table: `python -m benchmarks.scene_speed HAND FOLDER`.
+"""Times a ranking of grasp files, from command to table: `python -m benchmarks.scene_speed HAND FOLDER`.
 
 FOLDER has an object's convex `pieces` and `grasps.npz`, in the layout of DexGraspBench. `jaxgrasp rank` is run as a
 command of its own: first with nothing on disk, then again with programs and kernels there, then with 10,000

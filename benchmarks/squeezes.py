@@ -43,7 +43,7 @@ def travel(grasps: GraspSet) -> float:
 
 
 def tried(grasps: GraspSet, **scene: object) -> tuple[Evaluation, str]:
-    """What became of grasps, and how long it took."""
+    """Tries grasps, and returns the outcomes and a phrase on how fast that was."""
     begun, worked = time.perf_counter(), time.process_time()
     found = jg.evaluate(grasps, **scene)
     rate = len(grasps) / (time.perf_counter() - begun)

@@ -356,7 +356,7 @@ def _written(home: Path, name: str, ending: str, content: bytes | str) -> tuple[
 
 
 def quietly(folder: Path) -> list[Case]:
-    """The same without NumPy's warnings about what they are made of."""
+    """Returns the same cases, without NumPy's warnings about how they are made."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return cases(folder)

@@ -1,4 +1,4 @@
-"""What `jaxgrasp convert` does with malicious and broken files of grasps: one line, exit 2, and nothing in them runs.
+"""Gives `jaxgrasp convert` malicious and broken files of grasps: each must end in one line and exit 2, and run nothing.
 
 Each file is given to the command's `main` in a process of its own, forked from one that has imported everything; every
 `--sample`th is run as a command from its very start, too. A file `canary` in the working folder would show that

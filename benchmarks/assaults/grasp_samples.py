@@ -1,4 +1,4 @@
-"""The same four grasps in the layout of every format, with numbers of our own: what a reader must make of each."""
+"""Writes the same four grasps in the layout of every format, and says what a reader must make of them."""
 
 from __future__ import annotations
 

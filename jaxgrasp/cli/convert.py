@@ -44,10 +44,10 @@ class Convert(Reading):
     the names and the order of joints."""
 
     object: str | None = None
-    """What the object is called in the files written; None is what the files say."""
+    """Name of the object in the files written; without it the name that the files say."""
 
     scale: float | None = None
-    """Of the object's lengths; None is what the files say."""
+    """Factor on the object's lengths; without it the one that the files say."""
 
     keep_going: bool = False
     """Pass over files that cannot be used, with a line for each; the exit code is 2 then."""

@@ -53,13 +53,13 @@ class Evaluate(Published):
     """Largest normal force of a contact, N, for metrics."""
 
     seed: int = 0
-    """Of the resamples that intervals of areas are made of; trials have nothing random."""
+    """Seed of the bootstrap for the intervals of areas under ROC curves; the trials have nothing random."""
 
     workers: int | None = None
-    """How many threads; None for one a core."""
+    """Number of threads; one for each core without it."""
 
     movies: int = 0
-    """How many of the grasps that failed to render, the first ones: movies beside the table."""
+    """Number of movies, written beside the table, of the first grasps that failed."""
 
     output: Path | None = Path("trials.parquet")
     """The table to write, .parquet, .csv or .npz; None for no table."""

@@ -1,4 +1,4 @@
-"""What `jaxgrasp evaluate` prints."""
+"""Prints the summary of `jaxgrasp evaluate`."""
 
 import sys
 from collections.abc import Sequence

@@ -136,7 +136,7 @@ def _tell(notes: Sequence[str]) -> None:
 
 
 def _as_option(text: str) -> str:
-    """What is wrong with the hand, with the option that names it."""
+    """Puts the option `--hand` in front of a message about the hand."""
     return f"--{text}" if text.startswith("hand: ") else text
 
 

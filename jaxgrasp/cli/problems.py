@@ -25,7 +25,7 @@ class Skipped:
     def __init__(self) -> None:
         """Starts with none."""
         self.count = 0
-        """How many there were."""
+        """Number of files that were passed over."""
 
     def __call__(self, error: Exception) -> None:
         """Tells what is wrong with one."""

@@ -34,7 +34,7 @@ class Published(Reading):
     """The format of --grasps; None looks at the content of each file. A wrong name is answered with all names."""
 
     scale: float | None = None
-    """Of the objects' lengths; None is the grasps' own."""
+    """Factor on the objects' lengths; without it the one that each grasp says."""
 
     servo_gain: float | None = None
     """Give joints without an actuator, and motors, position servos of this many N m/rad, and joints without damping,
@@ -45,7 +45,7 @@ class Published(Reading):
 
     @property
     def name(self) -> str:
-        """What the hand is called."""
+        """Name of the hand, for messages."""
         return self.hand
 
     @property
