@@ -51,8 +51,11 @@ def fenced(function: Callable[P, T]) -> Callable[P, T]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
         if not _fences.get():
             return function(*args, **kwargs)
+        # With a single result that XLA divides over threads, a function inside another one passes for a divided call,
+        # which has no symbol to call there. A second result makes it a tuple.
+        paired = jax.jit(lambda *args, **kwargs: (function(*args, **kwargs), jnp.zeros((), bool)))
         with set_xla_metadata(inlineable="false"):
-            return jax.jit(function)(*args, **kwargs)
+            return paired(*args, **kwargs)[0]
 
     return wrapped
 

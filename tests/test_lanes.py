@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxgrasp.fence import fenced
 from jaxgrasp.kernels import without
 from jaxgrasp.solvers.lanes import Each, map_lanes
 
@@ -54,3 +55,19 @@ def test_programs_of_a_lane_are_lanes_of_their_own(fused):
         wanted = np.stack([expected(one, shared) for one in batches])
         np.testing.assert_allclose(jax.vmap(mapped, (0, None))(batches, jnp.asarray(shared)), wanted, rtol=1e-12)
         assert mapped(jnp.zeros((0, 3)), jnp.asarray(shared)).shape == (0,)
+
+
+def test_a_fenced_result_that_is_costly_enough_for_threads_stays_in_its_tile():
+    """XLA divides such an operation over threads, which it cannot do inside a tile that is one function."""
+
+    @fenced
+    def costly(x: jax.Array) -> jax.Array:
+        y = x
+        for _ in range(30):
+            y = jnp.sin(y * y + x)
+        return y
+
+    x = np.random.default_rng(0).random((512, 256), np.float32)
+    run = jax.jit(lambda x: map_lanes((lambda x: 2 * costly(x),), x, False, 8, compact=True))
+    with without():
+        np.testing.assert_allclose(run(x), 2 * costly(x), rtol=1e-5, atol=1e-5)
