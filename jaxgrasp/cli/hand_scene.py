@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxgrasp.cli.problems import CommandError, check_options
+from jaxgrasp.cli.checks import CommandError, check_options
 from jaxgrasp.cli.streams import one_line
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.problems import CommandError, Skipped, check_options, check_output, write_files
+from jaxgrasp.cli.checks import CommandError, Skipped, check_options, check_output, write_files
 from jaxgrasp.cli.published import Published, one_line_error
 from jaxgrasp.cli.setting import configure_jax
 from jaxgrasp.cli.streams import one_line, printing
