@@ -34,7 +34,7 @@ from jaxgrasp.ranking import compare_metrics, score  # noqa: E402
 from jaxgrasp.ranking.configurations import candidates_of  # noqa: E402
 from jaxgrasp.simulation import Trials, hold_trials  # noqa: E402
 from jaxgrasp.synthesis import Verdict, synthesize_hand_grasps  # noqa: E402
-from jaxgrasp.synthesis.hand_judgement import DEEPEST, LEAST_MARGIN, SHARE, Judgement, judged  # noqa: E402
+from jaxgrasp.synthesis.hand.judgement import DEEPEST, LEAST_MARGIN, SHARE, Judgement, judged  # noqa: E402
 
 HANDS = {"shadow_hand": shadow_hand, "four_fingers": four_fingers}
 OBJECTS = ("sphere", "box", "capsule", "cylinder", "mesh")

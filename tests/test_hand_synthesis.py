@@ -15,10 +15,11 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.hands import HandObject, scenes
 from jaxgrasp.hands.self_collision import self_pairs
 from jaxgrasp.hands.surroundings import Surroundings
-from jaxgrasp.synthesis import Verdict, Weights, hand_grasps, synthesize_hand_grasps
-from jaxgrasp.synthesis.hand_descent import retracted
-from jaxgrasp.synthesis.hand_energy import Task, terms_of
-from jaxgrasp.synthesis.hand_starts import random_starts
+from jaxgrasp.synthesis import Verdict, Weights, synthesize_hand_grasps
+from jaxgrasp.synthesis.hand import synthesis as hand_grasps
+from jaxgrasp.synthesis.hand.descent import retracted
+from jaxgrasp.synthesis.hand.energy import Task, terms_of
+from jaxgrasp.synthesis.hand.starts import random_starts
 
 STARTS, STEPS = 32, 80
 

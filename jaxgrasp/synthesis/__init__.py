@@ -2,9 +2,9 @@
 
 from jaxgrasp.synthesis.compliance import ComplianceResult, optimize_compliance
 from jaxgrasp.synthesis.grasps import Record, Synthesis, synthesize
-from jaxgrasp.synthesis.hand_energy import Weights
-from jaxgrasp.synthesis.hand_grasps import HandSynthesis, synthesize_hand_grasps
-from jaxgrasp.synthesis.hand_judgement import Verdict
+from jaxgrasp.synthesis.hand.energy import Weights
+from jaxgrasp.synthesis.hand.judgement import Verdict
+from jaxgrasp.synthesis.hand.synthesis import HandSynthesis, synthesize_hand_grasps
 
 __all__ = [
     "ComplianceResult",

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxgrasp.arrays import safe_norm
 from jaxgrasp.compiling import compiled
 from jaxgrasp.hands.surroundings import Surroundings
-from jaxgrasp.synthesis.hand_energy import Task, Terms, terms_of
+from jaxgrasp.synthesis.hand.energy import Task, Terms, terms_of
 
 # Steps of one call of the compiled program: between calls the progress is told.
 CHUNK = 10

@@ -14,10 +14,10 @@ from jaxgrasp.arrays import as_float
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.hands import HandObject
 from jaxgrasp.hands.surroundings import Surroundings
-from jaxgrasp.synthesis.hand_descent import CHUNK, State, advance
-from jaxgrasp.synthesis.hand_energy import Task, Terms, Weights
-from jaxgrasp.synthesis.hand_judgement import Judgement, Verdict, closed, judged, padded
-from jaxgrasp.synthesis.hand_starts import random_starts
+from jaxgrasp.synthesis.hand.descent import CHUNK, State, advance
+from jaxgrasp.synthesis.hand.energy import Task, Terms, Weights
+from jaxgrasp.synthesis.hand.judgement import Judgement, Verdict, closed, judged, padded
+from jaxgrasp.synthesis.hand.starts import random_starts
 
 # Starts at a time: what is done of one batch is not lost with the next.
 _BATCH = 1024
