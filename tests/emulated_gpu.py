@@ -15,7 +15,7 @@ import jax
 import pytest
 
 from jaxgrasp.kernels import cuda, gpu, launcher, machine, native
-from jaxgrasp.solvers import lanes
+from jaxgrasp.lanes import tiles as lanes
 
 SPECIAL = "@llvm.nvvm.read.ptx.sreg."
 # The numbers of a thread: its block, the threads of a block, its number in it.

@@ -12,7 +12,7 @@ import pytest
 
 from jaxgrasp import kernels
 from jaxgrasp.kernels import cuda, gpu, launcher, machine, native
-from jaxgrasp.solvers import lanes
+from jaxgrasp.lanes import tiles as lanes
 
 no_gpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="is about machines without a GPU")
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgrasp.fence import fenced
 from jaxgrasp.kernels import without
-from jaxgrasp.solvers.lanes import Each, map_lanes
+from jaxgrasp.lanes.fence import fenced
+from jaxgrasp.lanes.tiles import Each, map_lanes
 
 LANES, PROGRAMS = 37, 5
 FACTORS = np.arange(1.0, PROGRAMS + 1)

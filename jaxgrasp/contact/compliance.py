@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, fold
-from jaxgrasp.fence import each, fenced, repeat
+from jaxgrasp.lanes.fence import each, fenced, repeat
 from jaxgrasp.records import record
 
 RANK_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}

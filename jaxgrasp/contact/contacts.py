@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, frames_from_normals, placed
 from jaxgrasp.compiling import by_size, compiled
-from jaxgrasp.direct import filled, is_direct, power_of_two
+from jaxgrasp.lanes.direct import filled, is_direct, power_of_two
 from jaxgrasp.records import record
 
 

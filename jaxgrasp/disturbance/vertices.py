@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.disturbance.terms import Term, align, checked, combine, common, spread
-from jaxgrasp.fence import fenced
+from jaxgrasp.lanes.fence import fenced
 from jaxgrasp.records import record
 
 Tree = Any

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from jaxgrasp.arrays import fold, safe_norm
-from jaxgrasp.fence import fenced, fences
+from jaxgrasp.lanes.fence import fenced, fences
 
 FREE, BALL, SLIDE, HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE")

@@ -22,11 +22,11 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import mlir, xla
 
-from jaxgrasp.fence import loops
 from jaxgrasp.kernels import cpu, fingerprint, gpu, machine, outline
 from jaxgrasp.kernels.expressions import Unsupported
 from jaxgrasp.kernels.lowering import lowered
 from jaxgrasp.kernels.machine import Unavailable
+from jaxgrasp.lanes.fence import loops
 
 Tree = Any
 SETTING = "JAXGRASP_KERNELS"

@@ -20,9 +20,9 @@ from jaxtyping import Array, Float
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
+from jaxgrasp.lanes.independent import one_lane
 from jaxgrasp.metrics.interior import SMALLEST_BALL, contains_origin
 from jaxgrasp.metrics.wrench_space import WrenchSpace, checked, edges_of, hidden
-from jaxgrasp.solvers.independent import one_lane
 
 Norm = Literal["L1", "Linf"]
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.compliance import RANK_TOLERANCE
-from jaxgrasp.direct import power_of_two
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.lanes.direct import power_of_two
 from jaxgrasp.metrics import WrenchSpace
 from jaxgrasp.metrics.interior import contains_origin
 from jaxgrasp.metrics.wrench_space import edges_of

@@ -12,8 +12,8 @@ from jaxgrasp.contact.compliance import Compliance, pseudo_inverse
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import wrenches_of
+from jaxgrasp.lanes.differentiable import Plain
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
-from jaxgrasp.robustness.kernels import Plain
 
 
 def blocking_forces(

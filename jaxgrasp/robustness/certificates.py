@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced
+from jaxgrasp.lanes.fence import fenced
 from jaxgrasp.robustness.program import Program
 from jaxgrasp.solvers.block_kkt import BlockProblem, Record, Rows, adjoint_rows, total
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.lanes.differentiable import Along, OfPyramids
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.kernels import Along, OfPyramids
 from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem, weighed
 from jaxgrasp.robustness.program import Program, actuated_values, prepared, scaled_program
 from jaxgrasp.robustness.worst_case import reach_adjoint

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.fence import each, fenced
+from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.solvers.block_kkt import Blocks
 
 # Rows shorter than this, in units of the others, are zero but for rounding.

@@ -21,6 +21,8 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices, wrenches_of
+from jaxgrasp.lanes.differentiable import Along, Tree
+from jaxgrasp.lanes.tiles import Each
 from jaxgrasp.robustness.answers import (
     ACCEPTED,
     FormulationSolution,
@@ -51,10 +53,8 @@ from jaxgrasp.robustness.chain import (
     scaled_formulation,
 )
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.kernels import Along, Tree
 from jaxgrasp.solvers.conic_margin import ConicPoint
 from jaxgrasp.solvers.embedding import ConicOutcome
-from jaxgrasp.solvers.lanes import Each
 from jaxgrasp.solvers.status import Status
 
 # Contacts under all directions in a tile.

@@ -15,16 +15,16 @@ from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
-from jaxgrasp.direct import cut
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.kernels import usable
+from jaxgrasp.lanes.differentiable import Kernel, Lanes, differentiable
+from jaxgrasp.lanes.direct import cut
+from jaxgrasp.lanes.tiles import LOOSE_TILE, TILE
 from jaxgrasp.robustness.arguments import Arguments, laid_out
 from jaxgrasp.robustness.auditing import audited
 from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
-from jaxgrasp.robustness.kernels import Kernel, Lanes, differentiable
 from jaxgrasp.robustness.sizes import with_a_known_size
-from jaxgrasp.solvers.lanes import LOOSE_TILE, TILE
 
 
 @jax.tree_util.register_dataclass

@@ -12,6 +12,8 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.lanes.differentiable import Along, OfPyramids, Tree
+from jaxgrasp.lanes.tiles import Each
 from jaxgrasp.records import record
 from jaxgrasp.robustness.answers import Verdict, programs, solved_program, verdict
 from jaxgrasp.robustness.arguments import Arguments
@@ -28,12 +30,10 @@ from jaxgrasp.robustness.auditing.pyramids import balanced
 from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formulation
 from jaxgrasp.robustness.formulations import check_vertices, tile_of
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.kernels import Along, OfPyramids, Tree
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.arrow_problem import ArrowProblem, patterns_of
 from jaxgrasp.solvers.embedding import ConicOutcome
 from jaxgrasp.solvers.interior_point import Settings
-from jaxgrasp.solvers.lanes import Each
 from jaxgrasp.solvers.status import Status
 
 _FREE = FORMULATIONS["13"]

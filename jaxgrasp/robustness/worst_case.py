@@ -21,10 +21,10 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.sets import furthest, support
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import wrenches_of
-from jaxgrasp.fence import each, fenced
+from jaxgrasp.lanes.differentiable import OfPyramids, Plain
+from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.robustness.efforts import effort_reach
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
-from jaxgrasp.robustness.kernels import OfPyramids, Plain
 
 
 def worst_case(

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.lanes.fence import fenced, repeat
 from jaxgrasp.solvers.block_kkt import inverse_root, spread_over
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.triples import back, cholesky

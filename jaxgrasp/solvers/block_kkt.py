@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import each, fenced, repeat
+from jaxgrasp.lanes.fence import each, fenced, repeat
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 
 Rows = tuple[jax.Array, ...]

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.lanes.fence import fenced, repeat
 from jaxgrasp.solvers.block_kkt import (
     BlockProblem,
     Factors,

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.lanes.fence import fenced, repeat
 from jaxgrasp.solvers import cones
 from jaxgrasp.solvers.block_kkt import inverse_root
 from jaxgrasp.solvers.cones import Scaling

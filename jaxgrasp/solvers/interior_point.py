@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced
+from jaxgrasp.lanes.fence import fenced
 
 Tree = Any
 

@@ -30,8 +30,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxgrasp.compiling import own_settings
+from jaxgrasp.lanes.independent import one_lane
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program
-from jaxgrasp.solvers.independent import one_lane
 from jaxgrasp.solvers.interior_point import Iterate
 
 T = TypeVar("T")

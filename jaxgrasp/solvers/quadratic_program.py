@@ -11,10 +11,10 @@ from jax.typing import ArrayLike
 
 from jaxgrasp.arrays import as_float, broadcast_batch
 from jaxgrasp.compiling import compiled
+from jaxgrasp.lanes.independent import automatically, one_lane
 from jaxgrasp.records import record
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program, largest
-from jaxgrasp.solvers.independent import automatically, one_lane
 from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.qp_sensitivity import solution_of, value_at
 from jaxgrasp.solvers.status import Status

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced, repeat
+from jaxgrasp.lanes.fence import fenced, repeat
 from jaxgrasp.solvers.block_kkt import BlockProblem, Rows, adjoint_rows, apply_hessian, apply_rows, total
 from jaxgrasp.solvers.interior_point import Iterate, Residuals, reduce_rows
 

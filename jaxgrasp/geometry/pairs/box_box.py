@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxgrasp.arrays import fold, safe_divide
-from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.convex import nearest
 from jaxgrasp.geometry.pairs.geom import Body, Point
 from jaxgrasp.geometry.pairs.vectors import (
@@ -25,6 +24,7 @@ from jaxgrasp.geometry.pairs.vectors import (
     unit,
     unrotate,
 )
+from jaxgrasp.lanes.fence import fenced
 
 CORNERS = 8
 """An outline of four sides clipped by four sides has at most eight corners."""

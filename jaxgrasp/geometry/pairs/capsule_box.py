@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.geom import Body, Point
 from jaxgrasp.geometry.pairs.round_pairs import around
 from jaxgrasp.geometry.pairs.surfaces import to_box
 from jaxgrasp.geometry.pairs.vectors import Vector, choose, dot, each, pick, rotate, unrotate
+from jaxgrasp.lanes.fence import fenced
 
 # Edges nearer by less than this (m^2) are no nearer; edges and axes are parallel as in `round_pairs`.
 _TIE = 1e-15

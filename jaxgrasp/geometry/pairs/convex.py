@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxgrasp.arrays import safe_divide
-from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.geom import Body, Point
 from jaxgrasp.geometry.pairs.search import Simplex, search, supports
 from jaxgrasp.geometry.pairs.supports import is_smooth, radius, roundness
@@ -37,6 +36,7 @@ from jaxgrasp.geometry.pairs.vectors import (
     unrotate,
     zeros,
 )
+from jaxgrasp.lanes.fence import fenced
 
 # Newton's steps without derivatives before the one with.
 _STEPS = 5

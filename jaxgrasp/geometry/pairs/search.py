@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxgrasp.arrays import safe_divide
-from jaxgrasp.fence import fenced
 from jaxgrasp.geometry.pairs.geom import Body
 from jaxgrasp.geometry.pairs.supports import bulge, corner
 from jaxgrasp.geometry.pairs.vectors import (
@@ -29,6 +28,7 @@ from jaxgrasp.geometry.pairs.vectors import (
     unrotate,
     zeros,
 )
+from jaxgrasp.lanes.fence import fenced
 
 # Directions tried, and points tried for each.
 _CLIMBS = 40

@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import jax
 
-from jaxgrasp.fence import fences
 from jaxgrasp.geometry.pairs.box_box import CORNERS, box_box
 from jaxgrasp.geometry.pairs.capsule_box import capsule_box
 from jaxgrasp.geometry.pairs.convex import convex
 from jaxgrasp.geometry.pairs.geom import Body, Geom, Point, Touch, collected
 from jaxgrasp.geometry.pairs.round_pairs import capsule_capsule, sphere_with
 from jaxgrasp.geometry.pairs.surfaces import to_box, to_capsule, to_cylinder, to_ellipsoid, to_sphere
+from jaxgrasp.lanes.fence import fences
 
 _PAIRS: dict[tuple[str, str], tuple[int, Callable[[Body, Body], list[Point]]]] = {
     # One point, from the signed distance of the sphere's centre.

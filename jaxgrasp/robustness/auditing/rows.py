@@ -18,7 +18,7 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import wrenches_of
-from jaxgrasp.fence import fenced, fences
+from jaxgrasp.lanes.fence import fenced, fences
 from jaxgrasp.robustness.auditing.problem import Problem, facets
 
 # Shares of the longest row between which a row may count as independent or not: there the solver's word is taken.

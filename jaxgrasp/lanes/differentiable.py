@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
 from jaxgrasp.compiling import own_settings
-from jaxgrasp.solvers.lanes import map_lanes
-from jaxgrasp.solvers.linear_lanes import linear_lanes, transposed_lanes
+from jaxgrasp.lanes.linear import linear_lanes, transposed_lanes
+from jaxgrasp.lanes.tiles import map_lanes
 
 Tree = Any
 Raw = dict[str, jax.Array]

@@ -23,8 +23,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, xla
 
 from jaxgrasp.compiling import own_settings
-from jaxgrasp.solvers.independent import alike, independent, merged_axes, types
-from jaxgrasp.solvers.lanes import LOOSE_TILE, tiled
+from jaxgrasp.lanes.independent import alike, independent, merged_axes, types
+from jaxgrasp.lanes.tiles import LOOSE_TILE, tiled
 
 Tree = Any
 Kernel = Callable[[list[jax.Array], list[jax.Array]], list[jax.Array]]

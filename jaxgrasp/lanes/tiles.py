@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from jaxgrasp.fence import fences
 from jaxgrasp.kernels import fused, usable
-from jaxgrasp.solvers.independent import independent, on_one_device
+from jaxgrasp.lanes.fence import fences
+from jaxgrasp.lanes.independent import independent, on_one_device
 
 Tree = Any
 # Values of all rows of a tile: its working set has to fit in the second-level cache, and XLA's CPU backend would cut
