@@ -8,8 +8,8 @@ from scipy.optimize import linprog
 
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.block_kkt import Blocks
-from jaxgrasp.solvers.margin_problem import MarginProblem
+from jaxgrasp.solvers.block.kkt import Blocks
+from jaxgrasp.solvers.block.margin import MarginProblem
 
 CONTACTS, BOUNDED, EQUALITIES, EDGES, LANES = 4, 3, 7, 6, 20
 SETTINGS = interior_point.Settings(1e-8, 40, 1e-4, 0.0, equal_steps=False, safeguard=0.0, patience=8)

@@ -95,7 +95,7 @@ def test_imports_only_from_floors_below(path):
     ("room", "source"),
     [
         ("solvers", "from jaxgrasp.contact import Contacts"),
-        ("contact", "import jaxgrasp.solvers.block_kkt"),
+        ("contact", "import jaxgrasp.solvers.block.kkt"),
         ("contact", "from jaxgrasp import solvers"),
         ("contact", "def late():\n    from ..robustness import tightening"),
         ("ranking", "from jaxgrasp import rank"),

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float, Int
 from jaxgrasp.records import record
 from jaxgrasp.robustness.chain import Basics, Formulation, Scaled
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.solvers import embedding
-from jaxgrasp.solvers.conic_margin import ConeRows, ConicMargin
-from jaxgrasp.solvers.embedding import ConicOutcome
+from jaxgrasp.solvers.conic import embedding
+from jaxgrasp.solvers.conic.embedding import ConicOutcome
+from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
 from jaxgrasp.solvers.status import Status
 
 _TOLERANCE = {"float64": 1e-9, "float32": 1e-5}

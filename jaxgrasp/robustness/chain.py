@@ -22,7 +22,7 @@ from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.program import LEAST_FRICTION
-from jaxgrasp.solvers.conic_margin import ConeRows, ConicMargin
+from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
 
 
 class Formulation(NamedTuple):

@@ -24,9 +24,9 @@ from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem, weighed
 from jaxgrasp.robustness.program import Program, actuated_values, prepared, scaled_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
-from jaxgrasp.solvers.block_kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows, total
+from jaxgrasp.solvers.block.kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows, total
+from jaxgrasp.solvers.block.sensitivity import central_point, solve_symmetric
 from jaxgrasp.solvers.interior_point import Iterate, reduce_rows
-from jaxgrasp.solvers.sensitivity import central_point, solve_symmetric
 
 # kappa of the central points whose derivatives stand for those of the exact forces of (21) and of (22), in the solver's
 # units, and the largest residual with which they count as found. Of (21) many forces may be optimal, and what tells

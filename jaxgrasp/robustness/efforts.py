@@ -14,7 +14,7 @@ from jax import lax
 
 from jaxgrasp.arrays import fold, literal
 from jaxgrasp.lanes.fence import each, fenced
-from jaxgrasp.solvers.block_kkt import Blocks
+from jaxgrasp.solvers.block.kkt import Blocks
 
 # Rows shorter than this, in units of the others, are zero but for rounding.
 _NOTHING = {"float64": 1e-12, "float32": 1e-5}

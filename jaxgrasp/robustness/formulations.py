@@ -53,8 +53,8 @@ from jaxgrasp.robustness.chain import (
     scaled_formulation,
 )
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.solvers.conic_margin import ConicPoint
-from jaxgrasp.solvers.embedding import ConicOutcome
+from jaxgrasp.solvers.conic.embedding import ConicOutcome
+from jaxgrasp.solvers.conic.margin import ConicPoint
 from jaxgrasp.solvers.status import Status
 
 # Contacts under all directions in a tile.

@@ -9,9 +9,9 @@ from jax import lax
 from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.program import Program
-from jaxgrasp.solvers.block_kkt import Blocks, Rows
-from jaxgrasp.solvers.effort_problem import EffortProblem, least_curvature
-from jaxgrasp.solvers.margin_problem import MarginProblem
+from jaxgrasp.solvers.block.effort import EffortProblem, least_curvature
+from jaxgrasp.solvers.block.kkt import Blocks, Rows
+from jaxgrasp.solvers.block.margin import MarginProblem
 
 _REFINEMENTS = {"float64": 0, "float32": 1}
 

@@ -22,7 +22,7 @@ from jaxgrasp.lanes.fence import fenced
 from jaxgrasp.robustness.efforts import EffortRows, effort_unit, joined_rows, packed, unpacked
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.worst_case import reach_outside, worst_rows
-from jaxgrasp.solvers.block_kkt import Blocks, Record, Rows, total
+from jaxgrasp.solvers.block.kkt import Blocks, Record, Rows, total
 from jaxgrasp.solvers.interior_point import Iterate
 
 # Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.

@@ -23,7 +23,7 @@ from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.program import Program, prepared
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.robustness.tightening_lanes import at_centre, evidence, solve_effort, solve_margin
-from jaxgrasp.solvers.block_kkt import Record
+from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.status import Status
 
 

@@ -15,7 +15,7 @@ from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_probl
 from jaxgrasp.robustness.program import Program, actuated_values
 from jaxgrasp.robustness.solution import Solution
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.block_kkt import Record
+from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.status import Status
 

@@ -31,8 +31,8 @@ from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formu
 from jaxgrasp.robustness.formulations import check_vertices, tile_of
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.arrow_problem import ArrowProblem, patterns_of
-from jaxgrasp.solvers.embedding import ConicOutcome
+from jaxgrasp.solvers.block.arrow import ArrowProblem, patterns_of
+from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.interior_point import Settings
 from jaxgrasp.solvers.status import Status
 

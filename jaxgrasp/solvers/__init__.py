@@ -1,5 +1,5 @@
 """Mathematics that knows nothing of grasps."""
 
-from jaxgrasp.solvers.quadratic_program import QPSolution, solve_qp
+from jaxgrasp.solvers.dense.quadratic_program import QPSolution, solve_qp
 
 __all__ = ["QPSolution", "solve_qp"]

@@ -14,7 +14,7 @@ from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.auditing.problem import Problem
 from jaxgrasp.robustness.auditing.pyramids import CLOSED, MISSED, balanced, row_values
 from jaxgrasp.robustness.auditing.rows import own_inverse
-from jaxgrasp.solvers.conic_margin import ConicMargin, ConicPoint, inner
+from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, inner
 
 
 class ChainVerdict(NamedTuple):

@@ -31,7 +31,7 @@ from jax import lax
 
 from jaxgrasp.compiling import own_settings
 from jaxgrasp.lanes.independent import one_lane
-from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program
+from jaxgrasp.solvers.dense.embedding import CONSTANTS, Embedding, Program
 from jaxgrasp.solvers.interior_point import Iterate
 
 T = TypeVar("T")

@@ -16,11 +16,11 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers import cones
-from jaxgrasp.solvers.block_kkt import inverse_root
-from jaxgrasp.solvers.cones import Scaling
-from jaxgrasp.solvers.conic_margin import ConicMargin, ConicPoint, Parts, inner, most, over_blocks, reduce
-from jaxgrasp.solvers.triples import back, cholesky, down
+from jaxgrasp.solvers.block.kkt import inverse_root
+from jaxgrasp.solvers.conic import cones
+from jaxgrasp.solvers.conic.cones import Scaling
+from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, Parts, inner, most, over_blocks, reduce
+from jaxgrasp.solvers.small_matrices import back, cholesky, down
 
 _MAX_ITERATIONS = 60
 _PATIENCE = 6

@@ -18,9 +18,9 @@ import numpy as np
 
 from jaxgrasp.arrays import fold, literal
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers.block_kkt import inverse_root, spread_over
+from jaxgrasp.solvers.block.kkt import inverse_root, spread_over
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
-from jaxgrasp.solvers.triples import back, cholesky
+from jaxgrasp.solvers.small_matrices import back, cholesky
 
 
 class ArrowRecord(NamedTuple):

@@ -14,9 +14,9 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.lanes.independent import automatically, one_lane
 from jaxgrasp.records import record
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.dense_kkt import CONSTANTS, Embedding, Program, largest
+from jaxgrasp.solvers.dense.embedding import CONSTANTS, Embedding, Program, largest
+from jaxgrasp.solvers.dense.sensitivity import solution_of, value_at
 from jaxgrasp.solvers.interior_point import Iterate, Settings
-from jaxgrasp.solvers.qp_sensitivity import solution_of, value_at
 from jaxgrasp.solvers.status import Status
 
 _EQUILIBRATIONS = 10

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers.block_kkt import (
+from jaxgrasp.solvers.block.kkt import (
     BlockProblem,
     Factors,
     Record,

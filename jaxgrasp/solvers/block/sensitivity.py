@@ -27,7 +27,7 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers.block_kkt import BlockProblem, Rows, adjoint_rows, apply_hessian, apply_rows, total
+from jaxgrasp.solvers.block.kkt import BlockProblem, Rows, adjoint_rows, apply_hessian, apply_rows, total
 from jaxgrasp.solvers.interior_point import Iterate, Residuals, reduce_rows
 
 _STEPS = 30

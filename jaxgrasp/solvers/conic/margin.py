@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.solvers import cones
-from jaxgrasp.solvers.block_kkt import spread_over
-from jaxgrasp.solvers.cones import Scaling
+from jaxgrasp.solvers.block.kkt import spread_over
+from jaxgrasp.solvers.conic import cones
+from jaxgrasp.solvers.conic.cones import Scaling
 
 Parts = tuple[jax.Array, ...]
 # Axes up to this length are reduced term by term.
