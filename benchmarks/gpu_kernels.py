@@ -30,7 +30,9 @@ from benchmarks.kernels import contacts_of, job, watched
 from benchmarks.suite import problems
 from benchmarks.suite.clock import by_turns, say
 from jaxgrasp import kernels
-from jaxgrasp.kernels import gpu, lowering, native
+from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels.gpu import module as gpu
+from jaxgrasp.kernels.program import lowering
 
 DTYPES = ("float64", "float32")
 SHAPES = ((4, 8), (3, 8), (5, 8), (8, 8))

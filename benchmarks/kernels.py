@@ -28,7 +28,10 @@ import jaxgrasp as jg
 from benchmarks.suite import floor, ours, problems
 from benchmarks.suite.clock import by_turns, say, warn_if_busy
 from jaxgrasp import kernels
-from jaxgrasp.kernels import cpu, lowering, machine, native, schedule
+from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.cpu import module as cpu
+from jaxgrasp.kernels.program import lowering, schedule
 
 DTYPES = ("float64", "float32")
 ROUNDS = 7

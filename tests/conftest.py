@@ -16,7 +16,7 @@ jax.config.update("jax_num_cpu_devices", 2)
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
 
-from jaxgrasp.kernels import native  # noqa: E402
+from jaxgrasp.kernels import fused as native  # noqa: E402
 from jaxgrasp.robustness.auditing import setting  # noqa: E402
 
 # Compilation is part of the first example's time, and the same examples every time make a failure repeatable.

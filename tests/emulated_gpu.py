@@ -14,7 +14,11 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxgrasp.kernels import cuda, gpu, launcher, machine, native
+from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.gpu import driver as cuda
+from jaxgrasp.kernels.gpu import handler as launcher
+from jaxgrasp.kernels.gpu import module as gpu
 from jaxgrasp.lanes import tiles as lanes
 
 SPECIAL = "@llvm.nvvm.read.ptx.sreg."

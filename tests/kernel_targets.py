@@ -9,7 +9,8 @@ from contextlib import contextmanager
 import jax
 import pytest
 
-from jaxgrasp.kernels import cpu, machine
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.cpu import module as cpu
 
 _NUMBERS = itertools.count()
 

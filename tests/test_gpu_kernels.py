@@ -22,8 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import jaxgrasp as jg  # noqa: E402
 from benchmarks import gpu_kernels  # noqa: E402
 from jaxgrasp import kernels  # noqa: E402
-from jaxgrasp.kernels import gpu, lowering, native
-from jaxgrasp.kernels.expressions import Unsupported
+from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels.gpu import module as gpu
+from jaxgrasp.kernels.program import lowering
+from jaxgrasp.kernels.program.expressions import Unsupported
 
 SAME_MARGIN = {"float64": 2e-8, "float32": 1e-4}
 """Of max(|margin|, Lambda). In float32 both may be off by what the method accepts."""

@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 from jaxgrasp import kernels
-from jaxgrasp.kernels import cuda, gpu, launcher, machine, native
+from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.gpu import driver as cuda
+from jaxgrasp.kernels.gpu import handler as launcher
+from jaxgrasp.kernels.gpu import module as gpu
 from jaxgrasp.lanes import tiles as lanes
 
 no_gpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="is about machines without a GPU")

@@ -11,7 +11,7 @@ import pytest
 from jax import lax
 
 from jaxgrasp import kernels
-from jaxgrasp.kernels import native
+from jaxgrasp.kernels import fused as native
 
 ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 """Relative, for short functions: reciprocals are good to a unit or two in the last place."""

@@ -15,8 +15,10 @@ import pytest
 from jax import lax
 
 from jaxgrasp import kernels
-from jaxgrasp.kernels import cpu, machine, native
-from jaxgrasp.kernels.lowering import lowered
+from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.cpu import module as cpu
+from jaxgrasp.kernels.program.lowering import lowered
 
 TARGETS = kernel_targets.targets()
 

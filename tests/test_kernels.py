@@ -20,7 +20,9 @@ from scipy import stats
 import jaxgrasp as jg
 from jaxgrasp import kernels
 from jaxgrasp.geometry.pairs.geom import Touch
-from jaxgrasp.kernels import machine, native, outline
+from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.store import outline
 
 SAME_MARGIN = {"float64": 2e-8, "float32": 1e-4}
 """Of max(|margin|, Lambda). In float32 both may be off by what the method accepts."""
@@ -242,7 +244,7 @@ def test_outlines_are_data():
     assert outline.read(outline.written({"edges": 8})) == {"edges": 8}
     for content in (
         b'{"class": ["os", "system"], "fields": {"command": null}}',
-        b'{"class": ["jaxgrasp.kernels.machine", "keep"], "fields": {"key": null, "objects": null}}',
+        b'{"class": ["jaxgrasp.kernels.code.llvm", "keep"], "fields": {"key": null, "objects": null}}',
         b"[]",
         b"no JSON",
     ):

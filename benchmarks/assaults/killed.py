@@ -73,13 +73,13 @@ def writers(rows: int) -> dict[str, tuple[str, Callable[[Path], None], Callable[
             np.savez(stream, positions=table.candidates.positions, margin=table.margin)
 
     def kernel(path: Path) -> None:
-        from jaxgrasp.kernels import machine
+        from jaxgrasp.kernels.code import llvm as machine
 
         os.environ["XDG_CACHE_HOME"] = str(path.parents[2])
         machine.keep(path.name, bytes(40_000_000))
 
     def read_kernel(path: Path) -> bool:
-        from jaxgrasp.kernels import machine
+        from jaxgrasp.kernels.code import llvm as machine
 
         os.environ["XDG_CACHE_HOME"] = str(path.parents[2])
         return machine.cached(path.name) == bytes(40_000_000)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from jaxgrasp.kernels.entries import aval_of
+from jaxgrasp.kernels.program.entries import aval_of
 
 
 def of_origin(known_as: str, given: list[jax.ShapeDtypeStruct], shared: tuple[bool, ...], described: str) -> str:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
 
-from jaxgrasp.kernels.entries import array, aval_of, kinds_of, known, objects
-from jaxgrasp.kernels.expressions import Builder, Region, Unsupported, Value, kind_of
-from jaxgrasp.kernels.rules import ELEMENTWISE, RULES
+from jaxgrasp.kernels.program.entries import array, aval_of, kinds_of, known, objects
+from jaxgrasp.kernels.program.expressions import Builder, Region, Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.rules import ELEMENTWISE, RULES
 
 # Loops of at most so many rounds are spelt out: always, as the first round often starts from zeros and the last one
 # leaves what nobody asks for; where a round depends on its number; and where each leaves a result.

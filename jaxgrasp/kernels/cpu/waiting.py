@@ -8,7 +8,7 @@ What a thread keeps beside its two frames, its book, in words: how many lanes wa
 where to where lanes are being moved.
 """
 
-from jaxgrasp.kernels.vector_code import VectorCode
+from jaxgrasp.kernels.cpu.vectors import VectorCode
 
 # Bytes of two frames, which are on a thread's stack; where they would be more, nothing waits.
 _MOST_FRAMES = 3 << 17

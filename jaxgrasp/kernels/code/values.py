@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.kernels.expressions import Value
-from jaxgrasp.kernels.instructions import Instructions
-from jaxgrasp.kernels.lowering import Guard, Loop
+from jaxgrasp.kernels.code.instructions import Instructions
+from jaxgrasp.kernels.program.expressions import Value
+from jaxgrasp.kernels.program.lowering import Guard, Loop
 
 _INTEGERS = {"add": "add", "sub": "sub", "mul": "mul"}
 _FLOATS = {"add": "fadd", "sub": "fsub", "mul": "fmul"}

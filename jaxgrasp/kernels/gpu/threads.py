@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.kernels.expressions import Unsupported, Value
-from jaxgrasp.kernels.lowering import Guard, Loop
-from jaxgrasp.kernels.schedule import Schedule, in_memory
-from jaxgrasp.kernels.value_code import ValueCode
+from jaxgrasp.kernels.code.values import ValueCode
+from jaxgrasp.kernels.program.expressions import Unsupported, Value
+from jaxgrasp.kernels.program.lowering import Guard, Loop
+from jaxgrasp.kernels.program.schedule import Schedule, in_memory
 
 # Functions that GPUs have instructions for; what else there is would be calls into a library.
 _NATIVE = {"fma", "sqrt", "fabs", "floor"}

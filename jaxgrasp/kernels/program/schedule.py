@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from jaxgrasp.kernels.expressions import Region, Value
-from jaxgrasp.kernels.lowering import Guard, Loop, Program
-from jaxgrasp.kernels.sums import chain_sums
+from jaxgrasp.kernels.program.expressions import Region, Value
+from jaxgrasp.kernels.program.lowering import Guard, Loop, Program
+from jaxgrasp.kernels.program.sums import chain_sums
 
 Step = Loop | Guard
 

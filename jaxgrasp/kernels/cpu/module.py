@@ -7,13 +7,13 @@ unpacked by XLA's own threads, which take them from a common counter. All of it 
 import math
 from collections.abc import Callable
 
-from jaxgrasp.kernels import machine
-from jaxgrasp.kernels.expressions import Unsupported, Value, kind_of
-from jaxgrasp.kernels.handler import HANDLER, SPOIL
-from jaxgrasp.kernels.lowering import Program
-from jaxgrasp.kernels.schedule import scheduled
-from jaxgrasp.kernels.vector_code import VectorCode
-from jaxgrasp.kernels.waiting import blocks, waits
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.cpu.handler import HANDLER, SPOIL
+from jaxgrasp.kernels.cpu.vectors import VectorCode
+from jaxgrasp.kernels.cpu.waiting import blocks, waits
+from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.lowering import Program
+from jaxgrasp.kernels.program.schedule import scheduled
 
 # As XLA calls the devices.
 PLATFORM = "cpu"

@@ -6,8 +6,8 @@ the best choice is known: out goes what is used last. Around loops and guards ev
 
 from typing import Any
 
-from jaxgrasp.kernels.expressions import Value
-from jaxgrasp.kernels.schedule import Schedule, in_memory
+from jaxgrasp.kernels.program.expressions import Value
+from jaxgrasp.kernels.program.schedule import Schedule, in_memory
 
 
 class Registers:

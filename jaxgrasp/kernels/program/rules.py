@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.kernels.entries import array, kind_of_scalar, kinds_of, known, like, objects
-from jaxgrasp.kernels.expressions import Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.entries import array, kind_of_scalar, kinds_of, known, like, objects
+from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
 
 # Operations entry by entry, by the name that JAX gives them.
 ELEMENTWISE = {

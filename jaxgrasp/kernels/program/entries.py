@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jax.core import ShapedArray
 
-from jaxgrasp.kernels.expressions import Value, kind_of
+from jaxgrasp.kernels.program.expressions import Value, kind_of
 
 
 def array(entries: list[Any], shape: tuple[int, ...]) -> np.ndarray:

@@ -9,12 +9,14 @@ from typing import NamedTuple
 
 import jax
 
-from jaxgrasp.kernels import cuda, launcher, machine
-from jaxgrasp.kernels.expressions import Unsupported, Value, kind_of
-from jaxgrasp.kernels.lowering import Program
-from jaxgrasp.kernels.machine import Unavailable
-from jaxgrasp.kernels.schedule import scheduled
-from jaxgrasp.kernels.thread_code import ThreadCode
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.code.llvm import Unavailable
+from jaxgrasp.kernels.gpu import driver as cuda
+from jaxgrasp.kernels.gpu import handler as launcher
+from jaxgrasp.kernels.gpu.threads import ThreadCode
+from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.lowering import Program
+from jaxgrasp.kernels.program.schedule import scheduled
 
 # As XLA calls the devices.
 PLATFORM = "CUDA"

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.kernels.expressions import Value
-from jaxgrasp.kernels.lowering import Guard, Loop
-from jaxgrasp.kernels.registers import Registers
-from jaxgrasp.kernels.schedule import Schedule, in_memory
-from jaxgrasp.kernels.value_code import ValueCode
+from jaxgrasp.kernels.code.values import ValueCode
+from jaxgrasp.kernels.cpu.registers import Registers
+from jaxgrasp.kernels.program.expressions import Value
+from jaxgrasp.kernels.program.lowering import Guard, Loop
+from jaxgrasp.kernels.program.schedule import Schedule, in_memory
 
 
 def main_loop(schedule: Schedule) -> Loop | None:

@@ -4,7 +4,7 @@ import ctypes
 import functools
 from typing import Any
 
-from jaxgrasp.kernels.machine import Unavailable
+from jaxgrasp.kernels.code.llvm import Unavailable
 
 # Kernels that belong to no context came with this version.
 _OLDEST = 12000

@@ -22,10 +22,13 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import mlir, xla
 
-from jaxgrasp.kernels import cpu, fingerprint, gpu, machine, outline
-from jaxgrasp.kernels.expressions import Unsupported
-from jaxgrasp.kernels.lowering import lowered
-from jaxgrasp.kernels.machine import Unavailable
+from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.code.llvm import Unavailable
+from jaxgrasp.kernels.cpu import module as cpu
+from jaxgrasp.kernels.gpu import module as gpu
+from jaxgrasp.kernels.program.expressions import Unsupported
+from jaxgrasp.kernels.program.lowering import lowered
+from jaxgrasp.kernels.store import fingerprint, outline
 from jaxgrasp.lanes.fence import loops
 
 Tree = Any

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
-from jaxgrasp.kernels.expressions import Value
+from jaxgrasp.kernels.program.expressions import Value
 
 # Longer sums are cut in two, for the rounding's sake as well.
 _LONGEST = 16
