@@ -30,7 +30,7 @@ from benchmarks.kernels import contacts_of, job, watched
 from benchmarks.suite import problems
 from benchmarks.suite.clock import by_turns, say
 from jaxgrasp import kernels
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.gpu import module as gpu
 from jaxgrasp.kernels.program import lowering
 
@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one batch size; writes nothing")
     chosen = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    os.environ[native.SETTING] = "fused"
+    os.environ[primitive.SETTING] = "fused"
     there = jax.default_backend() == "gpu" and kernels.usable("cuda")
     if not (there or chosen.inspect):
         sys.exit("there is no GPU that fused kernels run on here; --inspect needs none")

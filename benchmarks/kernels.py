@@ -28,10 +28,11 @@ import jaxgrasp as jg
 from benchmarks.suite import floor, ours, problems
 from benchmarks.suite.clock import by_turns, say, warn_if_busy
 from jaxgrasp import kernels
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.code import llvm as machine
 from jaxgrasp.kernels.cpu import module as cpu
 from jaxgrasp.kernels.program import lowering, schedule
+from jaxgrasp.kernels.store import folder
 
 DTYPES = ("float64", "float32")
 ROUNDS = 7
@@ -108,17 +109,17 @@ def on_xla(function, *args):
 def watched() -> Iterator[list]:
     """The programs that become kernels inside."""
     seen: list = []
-    target = native.target
+    target = primitive.target
 
     def watching(plan):
         seen.append((plan.trace(), plan.shared))
         return target(plan)
 
-    native.target = watching
+    primitive.target = watching
     try:
         yield seen
     finally:
-        native.target = target
+        primitive.target = target
 
 
 def flops(jaxpr, shared, iterations: float) -> float:
@@ -303,9 +304,9 @@ def compile_seconds(jaxpr, shared) -> tuple[float, float]:
     width = at.vector_bytes // program.builder.dtype.itemsize
     objects = machine.compiled(cpu.module(program, "timed", width, estimates=at.estimates))
     cold = time.perf_counter() - start
-    machine.keep("timed", objects)
+    folder.keep("timed", objects)
     start = time.perf_counter()
-    machine.loaded(machine.cached("timed"), "timed")
+    machine.loaded(folder.cached("timed"), "timed")
     return cold, time.perf_counter() - start
 
 

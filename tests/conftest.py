@@ -16,7 +16,7 @@ jax.config.update("jax_num_cpu_devices", 2)
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
 
-from jaxgrasp.kernels import fused as native  # noqa: E402
+from jaxgrasp.kernels import primitive  # noqa: E402
 from jaxgrasp.robustness.auditing import setting  # noqa: E402
 
 # Compilation is part of the first example's time, and the same examples every time make a failure repeatable.
@@ -41,5 +41,5 @@ def compilations():
 @pytest.fixture(autouse=True)
 def trust(monkeypatch):
     """One test's answer that the audit does not confirm takes no kernels, and no warning, from the others."""
-    monkeypatch.setattr(native, "_trusted", True)
+    monkeypatch.setattr(primitive, "_trusted", True)
     monkeypatch.setattr(setting, "_warned", False)

@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.code import llvm as machine
 from jaxgrasp.kernels.gpu import driver as cuda
 from jaxgrasp.kernels.gpu import handler as launcher
@@ -115,8 +115,8 @@ def in_place(folder: Path) -> Iterator[None]:
     there = jax.default_backend() == "gpu"
 
     def fused(function, leaves, shared, otherwise, known_as=None, platform="cpu" if there else "cuda"):
-        wanted = platform == "cuda" and native._allowed.value
-        return native.fused(function, leaves, shared, no_kernel if wanted else otherwise, known_as, platform)
+        wanted = platform == "cuda" and primitive._allowed.value
+        return primitive.fused(function, leaves, shared, no_kernel if wanted else otherwise, known_as, platform)
 
     def module(program, name, write=gpu.module):
         codes.append(write(program, name))
@@ -124,16 +124,16 @@ def in_place(folder: Path) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        patch.setenv(native.SETTING, "fused")
+        patch.setenv(primitive.SETTING, "fused")
         patch.setattr(gpu, "module", module)
         patch.setattr(lanes, "fused", fused)
         if not there:
             emulate(patch)
         jax.clear_caches()
-        assert native.usable("cuda")
+        assert primitive.usable("cuda")
         yield
     if not there:
-        native._works.cache_clear()
+        primitive._works.cache_clear()
     jax.clear_caches()
 
 
@@ -147,7 +147,7 @@ def emulate(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(cuda, "launch_address", launch_address)
     assert asks in launcher._HANDLER
     patch.setattr(launcher, "_HANDLER", launcher._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
-    patch.setattr(native, "usable", lambda platform: native._allowed.value and native._works(platform))
+    patch.setattr(primitive, "usable", lambda platform: primitive._allowed.value and primitive._works(platform))
 
 
 # What XLA hands to a handler, see xla/ffi/api/c_api.h.

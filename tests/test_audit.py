@@ -175,7 +175,7 @@ def test_what_fails_keeps_what_is_confirmed_and_has_no_derivative(monkeypatch, g
 def test_the_first_wrong_answer_warns_and_ends_the_kernels(monkeypatch, given):
     monkeypatch.undo()
     monkeypatch.setattr(setting, "_warned", False)
-    monkeypatch.setattr(kernels.native, "_trusted", True)
+    monkeypatch.setattr(kernels.primitive, "_trusted", True)
     hurt(monkeypatch, "(21)", CHANGES["no forces"])
     with pytest.warns(RuntimeWarning, match=f"1 of {LANES} answers failed the audit"):
         solved(given, "(21)")

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import jaxgrasp as jg  # noqa: E402
 from benchmarks import gpu_kernels  # noqa: E402
 from jaxgrasp import kernels  # noqa: E402
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.gpu import module as gpu
 from jaxgrasp.kernels.program import lowering
 from jaxgrasp.kernels.program.expressions import Unsupported
@@ -46,7 +46,9 @@ def emulated(tmp_path):
 def assert_same(function, *leaves, shared=None):
     """A function of one problem over the leading axis, fused and by XLA; the lane axis trails inside."""
     shared = shared or (False,) * len(leaves)
-    ours = native.fused(lambda parts: function(*parts), list(leaves), shared, emulated_gpu.no_kernel, platform="cuda")
+    ours = primitive.fused(
+        lambda parts: function(*parts), list(leaves), shared, emulated_gpu.no_kernel, platform="cuda"
+    )
     one = lambda *parts: jax.tree.map(lambda x: x[..., 0], function(*[x[..., None] for x in parts]))  # noqa: E731
     theirs = jax.vmap(one, [None if s else 0 for s in shared])(*leaves)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxgrasp import kernels
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.code import llvm as machine
 from jaxgrasp.kernels.gpu import driver as cuda
 from jaxgrasp.kernels.gpu import handler as launcher
@@ -210,7 +210,7 @@ def test_without_a_gpu_nothing_is_looked_for(monkeypatch):
     monkeypatch.setattr(cuda, "driver", look)
     monkeypatch.setattr(gpu, "devices", look)
     for asked in ("auto", "xla", "fused"):
-        monkeypatch.setenv(native.SETTING, asked)
+        monkeypatch.setenv(primitive.SETTING, asked)
         assert not kernels.usable("cuda")
         assert kernels.usable() == (asked != "xla")
 
@@ -220,13 +220,13 @@ def test_where_a_gpu_cannot_be_used_one_warning_says_why(monkeypatch):
     """JAX says that there is one, but not one of NVIDIA's."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not kernels.usable("cuda")
-    monkeypatch.setenv(native.SETTING, "fused")
-    native._tell.cache_clear()
+    monkeypatch.setenv(primitive.SETTING, "fused")
+    primitive._tell.cache_clear()
     with pytest.warns(RuntimeWarning, match="JAX knows no GPU of NVIDIA's") as told:
         assert not kernels.usable("cuda")
         assert not kernels.usable("cuda")
     assert len(told) == 1
-    native._works.cache_clear()
+    primitive._works.cache_clear()
 
 
 @no_gpu
@@ -236,9 +236,9 @@ def test_a_kernel_that_does_not_load_is_left_to_xla(monkeypatch, tmp_path):
 
     with emulated_gpu.in_place(tmp_path):
         monkeypatch.setattr(cuda, "kernel", wrong)
-        native._tell.cache_clear()
+        primitive._tell.cache_clear()
         with pytest.warns(RuntimeWarning, match="does not load it"):
-            out = native.fused(doubled, [jnp.ones((3, 5))], (False,), lambda leaves: leaves[0] - 7, None, "cuda")
+            out = primitive.fused(doubled, [jnp.ones((3, 5))], (False,), lambda leaves: leaves[0] - 7, None, "cuda")
         np.testing.assert_array_equal(out, np.full((3, 5), -6))
 
 
@@ -253,9 +253,9 @@ def test_what_is_lowered_for_a_gpu(monkeypatch, tmp_path, asked, calls):
     with emulated_gpu.in_place(tmp_path):
         # As it is with a GPU, and lowering for its platform needs none.
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        monkeypatch.setattr(native, "usable", lanes.usable)
-        monkeypatch.setattr(lanes, "fused", native.fused)
-        monkeypatch.setenv(native.SETTING, asked)
+        monkeypatch.setattr(primitive, "usable", lanes.usable)
+        monkeypatch.setattr(lanes, "fused", primitive.fused)
+        monkeypatch.setenv(primitive.SETTING, asked)
         traced = jax.jit(run).trace(x)
         found = [traced.lower(lowering_platforms=(p,)).as_text().count("@jaxgrasp_") for p in ("cuda", "cpu")]
         assert found == [calls, 0]

@@ -11,7 +11,7 @@ import pytest
 from jax import lax
 
 from jaxgrasp import kernels
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 
 ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 """Relative, for short functions: reciprocals are good to a unit or two in the last place."""
@@ -19,7 +19,7 @@ ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 
 def fused(function, *leaves, shared=None):
     """A function of one problem over the leading axis, fused; the lane axis trails inside."""
-    run = partial(native.fused, shared=shared or (False,) * len(leaves), otherwise=no_kernel)
+    run = partial(primitive.fused, shared=shared or (False,) * len(leaves), otherwise=no_kernel)
     return run(lambda parts: function(*parts), list(leaves))
 
 
@@ -207,5 +207,5 @@ def test_what_cannot_be_fused_is_left_to_xla():
     def transform(parts):
         return jnp.fft.fft(parts[0][:, 0]).real[:, None]
 
-    left = native.fused(transform, [rows(3, 4)], (False,), lambda leaves: leaves[0] * 2)
+    left = primitive.fused(transform, [rows(3, 4)], (False,), lambda leaves: leaves[0] * 2)
     np.testing.assert_array_equal(left, rows(3, 4) * 2)

@@ -15,7 +15,7 @@ import pytest
 from jax import lax
 
 from jaxgrasp import kernels
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.code import llvm as machine
 from jaxgrasp.kernels.cpu import module as cpu
 from jaxgrasp.kernels.program.lowering import lowered
@@ -58,7 +58,7 @@ def inputs(dtype: str):
 
 def ran(target: machine.Machine, dtype: str) -> tuple[list[dict[str, np.ndarray]], str]:
     """Three calls, and the kernel's code."""
-    run = partial(native.fused, shared=(False, False), otherwise=lambda _: None)
+    run = partial(primitive.fused, shared=(False, False), otherwise=lambda _: None)
     with kernel_targets.compiled_for(target) as texts:
         calls = [run(function, list(inputs(dtype))) for _ in range(3)]
     return [{name: np.asarray(x) for name, x in call.items()} for call in calls], texts[-1]

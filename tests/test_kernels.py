@@ -20,7 +20,7 @@ from scipy import stats
 import jaxgrasp as jg
 from jaxgrasp import kernels
 from jaxgrasp.geometry.pairs.geom import Touch
-from jaxgrasp.kernels import fused as native
+from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.code import llvm as machine
 from jaxgrasp.kernels.store import outline
 
@@ -119,9 +119,9 @@ def run(code: str, **environment: str) -> subprocess.CompletedProcess:
 
 SMALL = """
 import jax, numpy as np, jax.numpy as jnp
-from jaxgrasp.kernels import native
-out = native.fused(lambda parts: parts[0] * 2, [jnp.ones((3, 2))], (False,), lambda leaves: jnp.zeros(1))
-again = native.fused(lambda parts: parts[0] * 3, [jnp.ones((3, 2))], (False,), lambda leaves: jnp.zeros(1))
+from jaxgrasp.kernels import primitive
+out = primitive.fused(lambda parts: parts[0] * 2, [jnp.ones((3, 2))], (False,), lambda leaves: jnp.zeros(1))
+again = primitive.fused(lambda parts: parts[0] * 3, [jnp.ones((3, 2))], (False,), lambda leaves: jnp.zeros(1))
 print(float(out.sum()))
 """
 
@@ -189,18 +189,18 @@ def test_kernels_are_kept_on_disk(tmp_path):
         assert run(SMALL, XDG_CACHE_HOME=str(tmp_path)).stdout.strip() == "12.0"
         assert [file.read_bytes() for file in kept] == whole
     folder.chmod(0o777)
-    monkey = "from jaxgrasp.kernels import machine; print(machine.cached('" + kept[0].name + "'))"
+    monkey = "from jaxgrasp.kernels.store import folder; print(folder.cached('" + kept[0].name + "'))"
     assert run(monkey, XDG_CACHE_HOME=str(tmp_path)).stdout.strip() == "None"
 
 
 KNOWN = """
 import jax.numpy as jnp
-from jaxgrasp.kernels import native
+from jaxgrasp.kernels import primitive
 def twice(parts):
     print("traced")
     return {"out": parts[0] * 2}
 for width in (2, 2, 5):
-    out = native.fused(twice, [jnp.ones((3, width))], (False,), lambda leaves: None, "twice")
+    out = primitive.fused(twice, [jnp.ones((3, width))], (False,), lambda leaves: None, "twice")
     print(float(out["out"].sum()))
 """
 
@@ -225,11 +225,11 @@ def test_a_folder_that_cannot_be_written(tmp_path):
 
 
 def test_a_warning_is_not_repeated():
-    native._tell.cache_clear()
+    primitive._tell.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        native._tell("a reason")
-        native._tell("a reason")
+        primitive._tell("a reason")
+        primitive._tell("a reason")
     assert len(told) == 1
 
 

@@ -73,16 +73,16 @@ def writers(rows: int) -> dict[str, tuple[str, Callable[[Path], None], Callable[
             np.savez(stream, positions=table.candidates.positions, margin=table.margin)
 
     def kernel(path: Path) -> None:
-        from jaxgrasp.kernels.code import llvm as machine
+        from jaxgrasp.kernels.store import folder
 
         os.environ["XDG_CACHE_HOME"] = str(path.parents[2])
-        machine.keep(path.name, bytes(40_000_000))
+        folder.keep(path.name, bytes(40_000_000))
 
     def read_kernel(path: Path) -> bool:
-        from jaxgrasp.kernels.code import llvm as machine
+        from jaxgrasp.kernels.store import folder
 
         os.environ["XDG_CACHE_HOME"] = str(path.parents[2])
-        return machine.cached(path.name) == bytes(40_000_000)
+        return folder.cached(path.name) == bytes(40_000_000)
 
     def picture(path: Path) -> None:
         write_figure(figure_of_ranking(table), path)

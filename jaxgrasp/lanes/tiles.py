@@ -17,7 +17,7 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from jaxgrasp.kernels import fused, usable
-from jaxgrasp.lanes.fence import fences
+from jaxgrasp.lanes.fence import fences, loops
 from jaxgrasp.lanes.independent import independent, on_one_device
 
 Tree = Any
@@ -214,7 +214,11 @@ def tiled(
     if not isinstance(lanes, int):
         # How many there are is known when the program runs.
         return in_small_tiles(leaves)
-    whole = partial(_in_turn, (first, *stages[1:]))
+
+    def whole(last: list[jax.Array]) -> Tree:
+        with loops():
+            return _in_turn((first, *stages[1:]), last)
+
     if platform == "cpu":
         return fused(whole, leaves, shared, in_compact_tiles, known_as)
     if platform == "cuda" and usable("cuda"):

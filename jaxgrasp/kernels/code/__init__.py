@@ -1,0 +1,1 @@
+"""LLVM text for scalar operations, common to all processors."""

@@ -1,14 +1,11 @@
-"""LLVM for the processor at hand, and the folder in which compiled kernels are kept."""
+"""LLVM for the processor at hand: its target, its options, object code and what becomes of it."""
 
 import contextlib
 import ctypes
 import functools
-import hashlib
 import os
 from collections.abc import Iterator
 from typing import Any, NamedTuple
-
-from jaxgrasp.storage import FileError, atomic_write, cache_folder, open_regular
 
 SETTING = "JAXGRASP_VECTOR_BITS"
 # What narrower vectors than the processor's are made without.
@@ -145,28 +142,3 @@ def capsule(address: int) -> Any:
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     return new(address, None, None)
-
-
-def cached(key: str) -> bytes | None:
-    """Read what was kept under this key; None unless it is whole and only this user could have written it."""
-    try:
-        with open_regular(cache_folder("kernels") / key) as stream:
-            content = stream.read()
-    except (OSError, FileError):
-        return None
-    digest, rest = content[:32], content[32:]
-    return rest if _digest(key, rest) == digest else None
-
-
-def keep(key: str, content: bytes) -> None:
-    """Keep object code, or what is known of a program.
-
-    Raises:
-        OSError: the folder cannot be written, or others could write to it.
-    """
-    with atomic_write(cache_folder("kernels") / key) as file:
-        file.write(_digest(key, content) + content)
-
-
-def _digest(key: str, content: bytes) -> bytes:
-    return hashlib.sha256(key.encode() + b"\n" + content).digest()

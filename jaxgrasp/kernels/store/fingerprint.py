@@ -18,7 +18,7 @@ def of_origin(known_as: str, given: list[jax.ShapeDtypeStruct], shared: tuple[bo
     It holds for one version of JAX and one state of the whole package, any file of which may be what is traced, and
     for the devices that are described.
     """
-    package = _source(Path(__file__).parents[1])
+    package = _source(Path(__file__).parents[2])
     arguments = [(x.shape, x.dtype.name, s) for x, s in zip(given, shared, strict=True)]
     parts = (package, described, jax.__version__, jax.config.read("jax_enable_x64"))
     return hashlib.sha256(repr((*parts, known_as, arguments)).encode()).hexdigest()
@@ -33,7 +33,7 @@ def _source(folder: Path) -> str:
 
 def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], described: str) -> str:
     """The same for programs that are the same, in any process with devices that are described so."""
-    room = _source(Path(__file__).parent)
+    room = _source(Path(__file__).parents[1])
     digest = hashlib.sha256(f"{room} {described} {shared}".encode())
     numbers: dict[Any, int] = {}
 
@@ -74,13 +74,8 @@ def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], described: str) -> 
     return digest.hexdigest()
 
 
-_INCIDENTAL = {"name", "jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "ctx_mesh", "donated_invars"}
-_INCIDENTAL |= {
-    "compiler_options_kvs",
-    "in_shardings",
-    "out_shardings",
-    "in_layouts",
-    "out_layouts",
-    "sharding",
-    "out_sharding",
+_INCIDENTAL = {
+    *("name", "jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "ctx_mesh", "donated_invars"),
+    *("compiler_options_kvs", "in_shardings", "out_shardings", "in_layouts", "out_layouts"),
+    *("sharding", "out_sharding"),
 }

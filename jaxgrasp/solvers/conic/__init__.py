@@ -1,0 +1,1 @@
+"""Programs with second-order cones, solved by a homogeneous embedding."""

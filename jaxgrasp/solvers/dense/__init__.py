@@ -1,0 +1,1 @@
+"""Quadratic programs without structure, `solve_qp`."""

@@ -1,0 +1,1 @@
+"""Synthesis of grasps with a hand: starts, descent, judgement."""

@@ -28,8 +28,7 @@ from jaxgrasp.kernels.cpu import module as cpu
 from jaxgrasp.kernels.gpu import module as gpu
 from jaxgrasp.kernels.program.expressions import Unsupported
 from jaxgrasp.kernels.program.lowering import lowered
-from jaxgrasp.kernels.store import fingerprint, outline
-from jaxgrasp.lanes.fence import loops
+from jaxgrasp.kernels.store import fingerprint, folder, outline
 
 Tree = Any
 SETTING = "JAXGRASP_KERNELS"
@@ -132,8 +131,7 @@ def _planned(
 
     @functools.cache
     def traced() -> tuple[ClosedJaxpr, Tree]:
-        with loops():
-            return jax.make_jaxpr(function, return_shape=True)(given)
+        return jax.make_jaxpr(function, return_shape=True)(given)
 
     def look() -> tuple[str, Tree]:
         jaxpr, out = traced()
@@ -146,7 +144,7 @@ def _planned(
         return Plan(*look(), trace, shared, platform)
     origin = fingerprint.of_origin(known_as, given, shared, described)
     if origin not in _origins:
-        kept = machine.cached(origin)
+        kept = folder.cached(origin)
         if kept is None:
             _origins[origin] = look()
             _keep(origin, b"\n".join((_origins[origin][0].encode(), outline.written(_origins[origin][1]))))
@@ -259,7 +257,7 @@ def target(plan: Plan) -> str:
 
 def _registered(plan: Plan) -> str:
     maker, name = _MAKERS[plan.platform], f"jaxgrasp_{plan.key[:32]}"
-    code = machine.cached(plan.key)
+    code = folder.cached(plan.key)
     try:
         if code is None:
             code = _compiled(plan, name)
@@ -285,7 +283,7 @@ def _compiled(plan: Plan, name: str) -> bytes:
 
 def _keep(key: str, content: bytes) -> None:
     try:
-        machine.keep(key, content)
+        folder.keep(key, content)
     except OSError as error:
         _tell_of_disk(str(error))
 
