@@ -26,7 +26,7 @@ from benchmarks.suite import chain, chain_peers  # noqa: E402
 from benchmarks.suite.clock import by_turns, say, warn_if_busy  # noqa: E402
 from benchmarks.suite.fresh import spent  # noqa: E402
 from benchmarks.suite.workers import Workers  # noqa: E402
-from jaxgrasp.robustness.comparison import STEPS  # noqa: E402
+from jaxgrasp.robustness.chain.comparison import STEPS  # noqa: E402
 
 HERE = Path(__file__).parent
 KEPT = HERE / "formulations.json"

@@ -11,9 +11,10 @@ import pytest
 from jax_sample import PUSHES, grasps
 
 import jaxgrasp as jg
-from jaxgrasp.robustness import auditing, sizes
+from jaxgrasp.robustness import auditing
 from jaxgrasp.robustness.auditing.pyramids import Verdict
-from jaxgrasp.robustness.tightening import _LargestDisturbance
+from jaxgrasp.robustness.interface import sizes
+from jaxgrasp.robustness.tightening.margin import _LargestDisturbance
 
 NOTHING = dict.fromkeys(
     ("required_wrench", "compliance", "cone_margin", "effort_weights", "margin", "smoothing", "cutoff", "actuation")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp.robustness.answers import ACCEPTED
+from jaxgrasp.robustness.chain.verdicts import ACCEPTED
 
 CALLS = 3
 TARGETS = kernel_targets.targets()

@@ -16,7 +16,7 @@ from jaxgrasp.metrics.matrices import closure_residual, isotropy, smallest_singu
 from jaxgrasp.metrics.task import task_wrench
 from jaxgrasp.metrics.wrench_space import WrenchSpace
 from jaxgrasp.robustness import largest_disturbance
-from jaxgrasp.robustness.formulations import formulation_margin
+from jaxgrasp.robustness.chain.formulations import formulation_margin
 from jaxgrasp.solvers.status import Status
 
 

@@ -1,18 +1,18 @@
 """The paper: worst cases (17)-(18), margin (21), least effort (22), blocking forces (15), and the way to them."""
 
-from jaxgrasp.robustness.answers import FormulationSolution
 from jaxgrasp.robustness.auditing import audit
 from jaxgrasp.robustness.blocking import blocking_forces
-from jaxgrasp.robustness.comparison import (
+from jaxgrasp.robustness.chain.comparison import (
     Comparison,
     SpecifiedDisturbances,
     compare_formulations,
     specified_disturbances,
 )
-from jaxgrasp.robustness.formulations import formulation_margin
-from jaxgrasp.robustness.solution import Solution
-from jaxgrasp.robustness.tightening import largest_disturbance, least_effort
-from jaxgrasp.robustness.total_effort import TotalEffortSolution, least_total_effort
+from jaxgrasp.robustness.chain.formulations import formulation_margin
+from jaxgrasp.robustness.chain.total_effort import TotalEffortSolution, least_total_effort
+from jaxgrasp.robustness.chain.verdicts import FormulationSolution
+from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.tightening.margin import largest_disturbance, least_effort
 from jaxgrasp.robustness.worst_case import worst_case
 
 __all__ = [

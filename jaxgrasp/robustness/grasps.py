@@ -21,10 +21,10 @@ from jaxgrasp.kernels import usable
 from jaxgrasp.lanes.differentiable import Kernel, Lanes, differentiable
 from jaxgrasp.lanes.direct import cut
 from jaxgrasp.lanes.tiles import LOOSE_TILE, TILE
-from jaxgrasp.robustness.arguments import Arguments, laid_out
+from jaxgrasp.robustness.actuators import Actuated, limited, stacked_rows
 from jaxgrasp.robustness.auditing import audited
-from jaxgrasp.robustness.efforts import Actuated, limited, stacked_rows
-from jaxgrasp.robustness.sizes import with_a_known_size
+from jaxgrasp.robustness.interface.arguments import Arguments, laid_out
+from jaxgrasp.robustness.interface.sizes import with_a_known_size
 
 
 @jax.tree_util.register_dataclass

@@ -23,7 +23,7 @@ from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.differentiable import OfPyramids, Plain
 from jaxgrasp.lanes.fence import each, fenced
-from jaxgrasp.robustness.efforts import effort_reach
+from jaxgrasp.robustness.actuators import effort_reach
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 
 

@@ -16,10 +16,10 @@ from jax.core import Tracer
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.robustness.arguments import Arguments, laid_out
 from jaxgrasp.robustness.auditing import setting
 from jaxgrasp.robustness.auditing.problem import every, picked
 from jaxgrasp.robustness.auditing.setting import audit
+from jaxgrasp.robustness.interface.arguments import Arguments, laid_out
 
 __all__ = ["Audited", "audit", "audited", "hidden"]
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold_last
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.terms import Term
-from jaxgrasp.robustness.arguments import Arguments
-from jaxgrasp.robustness.efforts import Actuated, limited
+from jaxgrasp.robustness.actuators import Actuated, limited
+from jaxgrasp.robustness.interface.arguments import Arguments
 
 
 class Problem(NamedTuple):

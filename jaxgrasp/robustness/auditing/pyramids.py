@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold, fold_last
-from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import hidden
 from jaxgrasp.robustness.auditing.problem import Hand, Problem, facets, problem_of
 from jaxgrasp.robustness.auditing.rows import Range, Rows, cross, own_rows
-from jaxgrasp.robustness.solution import Solution
+from jaxgrasp.robustness.interface.arguments import Arguments
+from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.solvers.status import Status
 
 # Shares of the largest force by which rows and G f = b may be missed, and of the margin's natural scale between a bound

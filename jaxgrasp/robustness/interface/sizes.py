@@ -14,7 +14,7 @@ from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.direct import filled, is_direct, power_of_two
-from jaxgrasp.robustness.arguments import ACTUATION_EVENTS
+from jaxgrasp.robustness.interface.arguments import ACTUATION_EVENTS
 
 # How many sizes above the small ones have programs of their own, for a function and its shapes.
 _OWN = 1

@@ -8,7 +8,7 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.program import Program
+from jaxgrasp.robustness.tightening.program import Program
 from jaxgrasp.solvers.block.effort import EffortProblem, least_curvature
 from jaxgrasp.solvers.block.kkt import Blocks, Rows
 from jaxgrasp.solvers.block.margin import MarginProblem

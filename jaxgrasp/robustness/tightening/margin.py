@@ -14,15 +14,15 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.differentiable import Along, OfPyramids, Tree
-from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited
 from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge, spot
 from jaxgrasp.robustness.auditing.setting import chosen_form
-from jaxgrasp.robustness.derivatives import CentralPoint, Point, envelope_adjoint
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
-from jaxgrasp.robustness.program import Program, prepared
-from jaxgrasp.robustness.solution import Solution
-from jaxgrasp.robustness.tightening_lanes import at_centre, evidence, solve_effort, solve_margin
+from jaxgrasp.robustness.interface.arguments import Arguments
+from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.tightening.decisions import at_centre, evidence, solve_effort, solve_margin
+from jaxgrasp.robustness.tightening.derivatives import CentralPoint, Point, envelope_adjoint
+from jaxgrasp.robustness.tightening.program import Program, prepared
 from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.status import Status
 

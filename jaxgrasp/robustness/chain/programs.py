@@ -21,7 +21,7 @@ from jaxgrasp.contact.compliance import RANK_TOLERANCE, pseudo_inverse, whitened
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.program import LEAST_FRICTION
+from jaxgrasp.robustness.tightening.program import LEAST_FRICTION
 from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxgrasp.records import record
-from jaxgrasp.robustness.chain import Basics, Formulation, Scaled
+from jaxgrasp.robustness.chain.programs import Basics, Formulation, Scaled
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.solvers.conic import embedding
 from jaxgrasp.solvers.conic.embedding import ConicOutcome

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.auditing.pyramids import Evidence
 from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
-from jaxgrasp.robustness.certificates import balanced, certified
-from jaxgrasp.robustness.derivatives import central_kappa, centred
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.problems import effort_of, effort_problem, margin_problem
-from jaxgrasp.robustness.program import Program, actuated_values
-from jaxgrasp.robustness.solution import Solution
+from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.tightening.certificates import balanced, certified
+from jaxgrasp.robustness.tightening.derivatives import central_kappa, centred
+from jaxgrasp.robustness.tightening.problems import effort_of, effort_problem, margin_problem
+from jaxgrasp.robustness.tightening.program import Program, actuated_values
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.interior_point import Iterate, Settings

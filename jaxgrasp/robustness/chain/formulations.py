@@ -23,14 +23,6 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices, wrenches_of
 from jaxgrasp.lanes.differentiable import Along, Tree
 from jaxgrasp.lanes.tiles import Each
-from jaxgrasp.robustness.answers import (
-    ACCEPTED,
-    FormulationSolution,
-    formulation_answer,
-    programs,
-    solved_program,
-)
-from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited, hidden
 from jaxgrasp.robustness.auditing.chain import (
     ChainVerdict,
@@ -43,7 +35,7 @@ from jaxgrasp.robustness.auditing.chain import (
 )
 from jaxgrasp.robustness.auditing.problem import Problem, problem_of
 from jaxgrasp.robustness.auditing.pyramids import balanced
-from jaxgrasp.robustness.chain import (
+from jaxgrasp.robustness.chain.programs import (
     FORMULATIONS,
     Basics,
     Formulation,
@@ -52,7 +44,15 @@ from jaxgrasp.robustness.chain import (
     contact_rows,
     scaled_formulation,
 )
+from jaxgrasp.robustness.chain.verdicts import (
+    ACCEPTED,
+    FormulationSolution,
+    formulation_answer,
+    programs,
+    solved_program,
+)
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
+from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.conic.margin import ConicPoint
 from jaxgrasp.solvers.status import Status

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced
-from jaxgrasp.robustness.program import Program
+from jaxgrasp.robustness.tightening.program import Program
 from jaxgrasp.solvers.block.kkt import BlockProblem, Record, Rows, adjoint_rows, total
 
 # The largest share of the larger of |b| and sum |f_i| that G f may miss b by in float32.

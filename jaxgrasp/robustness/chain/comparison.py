@@ -12,12 +12,12 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.records import record
-from jaxgrasp.robustness.answers import FormulationSolution
-from jaxgrasp.robustness.chain import FORMULATIONS
-from jaxgrasp.robustness.formulations import Chain, check_vertices, formulation_margin, tile_of
+from jaxgrasp.robustness.chain.formulations import Chain, check_vertices, formulation_margin, tile_of
+from jaxgrasp.robustness.chain.programs import FORMULATIONS
+from jaxgrasp.robustness.chain.verdicts import FormulationSolution
 from jaxgrasp.robustness.grasps import over_grasps
-from jaxgrasp.robustness.solution import Solution
-from jaxgrasp.robustness.tightening import largest_disturbance
+from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.tightening.margin import largest_disturbance
 from jaxgrasp.solvers.status import Status
 
 # What lies between neighbours of the chain: the larger margin first.

@@ -15,8 +15,6 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.differentiable import Along, OfPyramids, Tree
 from jaxgrasp.lanes.tiles import Each
 from jaxgrasp.records import record
-from jaxgrasp.robustness.answers import Verdict, programs, solved_program, verdict
-from jaxgrasp.robustness.arguments import Arguments
 from jaxgrasp.robustness.auditing import Audited, hidden
 from jaxgrasp.robustness.auditing.chain import (
     EffortVerdict,
@@ -27,9 +25,11 @@ from jaxgrasp.robustness.auditing.chain import (
 )
 from jaxgrasp.robustness.auditing.problem import problem_of
 from jaxgrasp.robustness.auditing.pyramids import balanced
-from jaxgrasp.robustness.chain import FORMULATIONS, Basics, basics, scaled_formulation
-from jaxgrasp.robustness.formulations import check_vertices, tile_of
+from jaxgrasp.robustness.chain.formulations import check_vertices, tile_of
+from jaxgrasp.robustness.chain.programs import FORMULATIONS, Basics, basics, scaled_formulation
+from jaxgrasp.robustness.chain.verdicts import Verdict, programs, solved_program, verdict
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
+from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.arrow import ArrowProblem, patterns_of
 from jaxgrasp.solvers.conic.embedding import ConicOutcome

@@ -19,7 +19,7 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.compliance import RANK_TOLERANCE, Basis, whitened
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.lanes.fence import fenced
-from jaxgrasp.robustness.efforts import EffortRows, effort_unit, joined_rows, packed, unpacked
+from jaxgrasp.robustness.actuators import EffortRows, effort_unit, joined_rows, packed, unpacked
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.worst_case import reach_outside, worst_rows
 from jaxgrasp.solvers.block.kkt import Blocks, Record, Rows, total
