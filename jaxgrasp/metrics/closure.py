@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.contact import Contacts
-from jaxgrasp.contact.compliance import RANK_TOLERANCE
+from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.metrics.wrench_space import Edges, WrenchSpace, edges_of, hidden, metric
 from jaxgrasp.records import record
 from jaxgrasp.solvers import QPSolution, solve_qp

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxgrasp.contact.compliance import RANK_TOLERANCE
+from jaxgrasp.contact.row_space import RANK_TOLERANCE
 
 SMALLEST_BALL = {"float64": 1e-7, "float32": 1e-3}
 """The radius of a ball about the origin, in units of the longest wrench, below which rounding decides about closure."""

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import safe_divide, safe_norm
 from jaxgrasp.contact import Contacts
-from jaxgrasp.contact.compliance import RANK_TOLERANCE
+from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, hidden, metric
 
 

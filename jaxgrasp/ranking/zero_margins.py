@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
-from jaxgrasp.contact.compliance import RANK_TOLERANCE
+from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.direct import power_of_two
 from jaxgrasp.metrics import WrenchSpace

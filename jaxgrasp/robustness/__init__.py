@@ -12,7 +12,8 @@ from jaxgrasp.robustness.chain.formulations import formulation_margin
 from jaxgrasp.robustness.chain.total_effort import TotalEffortSolution, least_total_effort
 from jaxgrasp.robustness.chain.verdicts import FormulationSolution
 from jaxgrasp.robustness.interface.solution import Solution
-from jaxgrasp.robustness.tightening.margin import largest_disturbance, least_effort
+from jaxgrasp.robustness.tightening.effort import least_effort
+from jaxgrasp.robustness.tightening.margin import largest_disturbance
 from jaxgrasp.robustness.worst_case import worst_case
 
 __all__ = [

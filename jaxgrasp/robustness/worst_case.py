@@ -14,9 +14,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import fold, literal, safe_divide
-from jaxgrasp.contact.compliance import Basis, Compliance, pseudo_inverse, pseudo_inverse_adjoint
+from jaxgrasp.contact.compliance import Compliance, pseudo_inverse, pseudo_inverse_adjoint
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.row_space import Basis
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.sets import furthest, support
 from jaxgrasp.disturbance.terms import Term

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.contact.compliance import RANK_TOLERANCE
+from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.fence import fenced, fences

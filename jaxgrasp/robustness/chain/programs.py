@@ -17,8 +17,9 @@ import numpy as np
 from jax import lax
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.contact.compliance import RANK_TOLERANCE, pseudo_inverse, whitened
+from jaxgrasp.contact.compliance import pseudo_inverse
 from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.row_space import RANK_TOLERANCE, whitened
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.tightening.program import LEAST_FRICTION

@@ -12,8 +12,7 @@ from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.certificates import balanced, certified
 from jaxgrasp.robustness.tightening.derivatives import central_kappa, centred
-from jaxgrasp.robustness.tightening.problems import effort_of, effort_problem, margin_problem
-from jaxgrasp.robustness.tightening.program import Program, actuated_values
+from jaxgrasp.robustness.tightening.program import Program, actuated_values, effort_of, effort_problem, margin_problem
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.interior_point import Iterate, Settings

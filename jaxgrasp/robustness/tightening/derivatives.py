@@ -21,8 +21,16 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.lanes.differentiable import Along, OfPyramids
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.problems import effort_of, effort_problem, margin_problem, weighed
-from jaxgrasp.robustness.tightening.program import Program, actuated_values, prepared, scaled_program
+from jaxgrasp.robustness.tightening.program import (
+    Program,
+    actuated_values,
+    effort_of,
+    effort_problem,
+    margin_problem,
+    prepared,
+    scaled_program,
+    weighed,
+)
 from jaxgrasp.robustness.worst_case import reach_adjoint
 from jaxgrasp.solvers.block.kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows, total
 from jaxgrasp.solvers.block.sensitivity import central_point, solve_symmetric

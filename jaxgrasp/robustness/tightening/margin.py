@@ -1,10 +1,7 @@
-"""Tightening forces: the largest-minimum resisted disturbance (21) and the least effort (22)."""
+"""The robustness margin with its tightening forces: the largest-minimum resisted disturbance, program (21)."""
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
@@ -13,17 +10,15 @@ from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.lanes.differentiable import Along, OfPyramids, Tree
-from jaxgrasp.robustness.auditing import Audited
-from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge, spot
+from jaxgrasp.lanes.differentiable import Along
+from jaxgrasp.robustness.auditing.pyramids import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
-from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.robustness.interface.solution import Solution
-from jaxgrasp.robustness.tightening.decisions import at_centre, evidence, solve_effort, solve_margin
-from jaxgrasp.robustness.tightening.derivatives import CentralPoint, Point, envelope_adjoint
-from jaxgrasp.robustness.tightening.program import Program, prepared
-from jaxgrasp.solvers.block.kkt import Record
+from jaxgrasp.robustness.tightening.decisions import at_centre, solve_margin
+from jaxgrasp.robustness.tightening.derivatives import envelope_adjoint
+from jaxgrasp.robustness.tightening.kernel import Tightening, changed
+from jaxgrasp.robustness.tightening.program import Program
 from jaxgrasp.solvers.status import Status
 
 
@@ -94,108 +89,7 @@ def largest_disturbance(
     )[0]
 
 
-def least_effort(
-    contacts: Contacts,
-    disturbances: DisturbanceSet,
-    margin: ArrayLike,
-    required_wrench: ArrayLike | None = None,
-    compliance: ArrayLike | Compliance | None = None,
-    effort_weights: ArrayLike | None = None,
-    cone_edges: int = 8,
-    cone_margin: ArrayLike = 0.0,
-    smoothing: ArrayLike | None = None,
-    actuation: Actuation | None = None,
-) -> Solution:
-    """The tightening forces of least effort that give a chosen margin, program (22).
-
-    min 1/2 f_0' Q_0 f_0 subject to the rows of (21) with lambda = margin. Solves (21) first, for a start and for the
-    certificate where the margin cannot be had.
-
-    Args:
-        contacts: the grasps; their dtype is the precision.
-        disturbances: the set D.
-        margin: lambda (*batch,), >= 0; usually a share, say 75 %, of (21)'s.
-        required_wrench: b (*batch, 6), N and N m; None is zero.
-        compliance: Q, as in `largest_disturbance`.
-        effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the
-            identity.
-        cone_edges: n_e.
-        cone_margin: d (*batch,), N, >= 0.
-        smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the
-            effort, this program's objective. None is the exact optimum.
-        actuation: what the hand can do, as in `largest_disturbance`; actuator efforts cost nothing.
-
-    Returns:
-        Solution; `margin` is what `forces` certify, at least the one asked for up to rounding, `upper_bound` that of
-        (21).
-
-    Raises:
-        ValueError: shapes or options that do not fit; at trace time.
-
-    Status:
-        As in `largest_disturbance`; INFEASIBLE where the margin is above what (21) allows; INVALID_INPUT where it is
-        negative or NaN.
-
-    Derivatives:
-        As in `largest_disturbance`, the margin asked for included; of exact forces those of the central point for 1e-8
-        (float32: 1e-5) of the effort's scale. `margin` varies like the one asked for, `upper_bound` counts as constant.
-        Zero for grasps without an answer.
-    """
-    pyramid_facets(cone_edges)
-    return over_grasps(
-        _LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"),
-        contacts,
-        disturbances,
-        required_wrench=required_wrench,
-        compliance=compliance,
-        cone_margin=cone_margin,
-        effort_weights=effort_weights,
-        margin=margin,
-        smoothing=smoothing,
-        actuation=actuation,
-    )[0]
-
-
-@dataclass(frozen=True)
-class _Tightening(OfPyramids, Audited, ABC):
-    """The common part of the kernels of (21) and (22), whose results are a solution and evidence for its audit."""
-
-    smooth: bool
-    evident: bool = True
-    """Whether the kernel writes evidence; without an audit nobody reads it."""
-
-    @property
-    def stages(self) -> tuple:
-        return (lambda grasps, _: prepared(grasps, self.cone_edges), lambda given: self._solve(*given))
-
-    @abstractmethod
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]: ...
-
-    def _evidence(self, grasps: Grasps, program: Program, record: Record) -> Evidence | None:
-        return evidence(grasps, program, record) if self.evident else None
-
-    def judge(self, arguments: Arguments, out: tuple[Solution, Evidence], anew: bool) -> Verdict:
-        return judge(arguments, *out, anew, self.smooth)
-
-    def spot(self, arguments: Arguments, out: tuple[Solution, Evidence]) -> jax.Array:
-        return spot(arguments, *out)
-
-    def correct(self, out: tuple[Solution, Evidence], verdicts: Verdict) -> tuple[Solution, Evidence]:
-        return corrected(out[0], verdicts), out[1]
-
-    def _point(self, out: Solution, usable: jax.Array) -> Point:
-        if self.smooth:
-            # At a central point all multipliers are positive; where there is none they are zero, or it was not found.
-            usable &= (out.status != Status.MAX_ITERATIONS) & jnp.any(out.bound_multipliers > 0, -1)
-        return Point(usable=usable, **{name: getattr(out, name) for name in Point._fields if name != "usable"})
-
-    def _central(self, along: Along, point: Point) -> Point:
-        """The derivative of everything at the central point, which is the point itself where smoothing is asked for."""
-        kernel = CentralPoint(self.cone_edges)
-        return kernel.tangents(along, point if self.smooth else along.value(kernel, point))
-
-
-class _LargestDisturbance(_Tightening):
+class _LargestDisturbance(Tightening):
     def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
         best, record, iterate = solve_margin(grasps, program)
         solution = best
@@ -211,22 +105,4 @@ class _LargestDisturbance(_Tightening):
         if not self.smooth:
             adjoint = partial(envelope_adjoint, self.cone_edges)
             change = change._replace(margin=along.adjoint(adjoint, point, (out.margin,))[0])
-        return _changed(found, change, change.margin)
-
-
-class _LeastEffort(_Tightening):
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
-        first, record, _ = solve_margin(replace(grasps, smoothing=None), program)
-        return solve_effort(grasps, program, first, record), self._evidence(grasps, program, record)
-
-    def tangents(self, along: Along, found: tuple) -> tuple:
-        out = found[0]
-        return _changed(found, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)
-
-
-def _changed(found: tuple[Solution, Evidence | None], change: Point, upper_bound: jax.Array | None) -> tuple:
-    """A change of the results; None for what does not vary, or counts as if it did not."""
-    varying = change._asdict() | {"upper_bound": upper_bound}
-    still = jax.tree.map(lambda _: None, found[1])
-    changes: dict[str, Tree] = {f.name: varying.get(f.name) for f in fields(Solution)}
-    return Solution(**changes), still
+        return changed(found, change, change.margin)
