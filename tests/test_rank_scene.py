@@ -7,7 +7,7 @@ import pyarrow.parquet
 import pytest
 
 from jaxgrasp.cli import main
-from jaxgrasp.cli.checks import CommandError
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.hands import scenes
 from jaxgrasp.viewer import offscreen

@@ -9,14 +9,9 @@ if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
 
 from jaxgrasp.cli import signals
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.streams import one_line
 from jaxgrasp.storage import check_writable, reason_of
-
-
-class CommandError(Exception):
-    """Something that the caller can mend, in one line."""
-
-    exit_code = 2
 
 
 class Skipped:

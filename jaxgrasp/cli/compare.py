@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from jaxgrasp.cli.checks import CommandError, Skipped, check_output, warn_of_conventions, write_files
+from jaxgrasp.cli.checks import Skipped, check_output, warn_of_conventions, write_files
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.scene import ComparedScene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances

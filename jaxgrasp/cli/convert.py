@@ -9,7 +9,8 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import CommandError, Skipped, check_options
+from jaxgrasp.cli.checks import Skipped, check_options
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.setting import Reading
 from jaxgrasp.cli.streams import one_line, printing
 from jaxgrasp.storage import check_writable, reason_of

@@ -11,7 +11,8 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import CommandError, Skipped, check_options, check_output, write_files
+from jaxgrasp.cli.checks import Skipped, check_options, check_output, write_files
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.published import Published, one_line_error
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax

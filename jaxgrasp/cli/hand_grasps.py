@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxgrasp.cli.checks import CommandError, Skipped
+from jaxgrasp.cli.checks import Skipped
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.streams import one_line
 from jaxgrasp.storage import FileError
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxgrasp.cli.checks import CommandError, check_options
+from jaxgrasp.cli.checks import check_options
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.streams import one_line
 
 if TYPE_CHECKING:

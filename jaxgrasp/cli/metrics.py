@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from jaxgrasp.cli.checks import CommandError
+from jaxgrasp.cli.errors import CommandError
 
 if TYPE_CHECKING:
     import numpy as np

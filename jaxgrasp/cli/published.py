@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxgrasp.cli.checks import CommandError, Skipped, check_options
+from jaxgrasp.cli.checks import Skipped, check_options
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.setting import Reading
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxgrasp.cli.checks import CommandError, Skipped, check_options
+from jaxgrasp.cli.checks import Skipped, check_options
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.hand_scene import HandScene
 from jaxgrasp.cli.streams import one_line
 from jaxgrasp.storage import FileError, read_archive, read_array

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxgrasp.cli.checks import CommandError
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.storage import cache_folder
 
 if TYPE_CHECKING:

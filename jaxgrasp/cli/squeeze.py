@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import CommandError, Skipped, check_options, check_output, write_files
+from jaxgrasp.cli.checks import Skipped, check_options, check_output, write_files
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.published import Published, one_line_error
 from jaxgrasp.cli.setting import configure_jax
 from jaxgrasp.cli.streams import one_line, printing

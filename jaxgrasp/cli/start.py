@@ -31,7 +31,7 @@ def run_process() -> None:
 
 
 def _answer(arguments: Sequence[str] | None) -> int:
-    from jaxgrasp.cli.checks import CommandError
+    from jaxgrasp.cli.errors import CommandError
     from jaxgrasp.cli.subcommands import parsed
     from jaxgrasp.storage import limited_to
 

@@ -67,7 +67,7 @@ def printing() -> Iterator[None]:
         with contextlib.suppress(OSError, AttributeError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
-            from jaxgrasp.cli.checks import CommandError
+            from jaxgrasp.cli.errors import CommandError
 
             raise CommandError(f"standard output: cannot be written ({error.strerror or error})") from error
     if leaving is not None:

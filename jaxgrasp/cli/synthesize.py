@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import CommandError, check_options, check_output, write_files
+from jaxgrasp.cli.checks import check_options, check_output, write_files
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import one_line, printing
 from jaxgrasp.cli.synthesize_hand import SceneSynthesis

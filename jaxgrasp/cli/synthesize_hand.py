@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import CommandError, check_options, write_files
+from jaxgrasp.cli.checks import check_options, write_files
+from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.hand_scene import HandScene
 from jaxgrasp.cli.streams import one_line, printing
 from jaxgrasp.storage import atomic_write
