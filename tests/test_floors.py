@@ -13,28 +13,29 @@ FLOORS = {
     "process": -2,
     "compiling": -1,
     "arrays": 0,
-    "direct": 0,
-    "fence": 0,
     "storage": 0,
     "records": 0,
     "kernels": 1,
-    "geometry": 2,
-    "contact": 2,
-    "disturbance": 2,
-    "solvers": 2,
-    "robustness": 3,
-    "metrics": 4,
-    "hands": 4,
-    "candidates": 4,
-    "files": 5,
-    "simulation": 5,
-    "synthesis": 6,
-    "ranking": 6,
-    "squeezing": 6,
-    "evaluation": 7,
-    "viewer": 8,
-    "cli": 9,
+    "lanes": 2,
+    "geometry": 3,
+    "contact": 3,
+    "disturbance": 3,
+    "solvers": 3,
+    "robustness": 4,
+    "metrics": 5,
+    "hands": 5,
+    "candidates": 5,
+    "files": 6,
+    "simulation": 6,
+    "synthesis": 7,
+    "ranking": 7,
+    "squeezing": 7,
+    "evaluation": 8,
+    "viewer": 9,
+    "cli": 10,
 }
+# The most rooms that a folder may have, a folder inside it counting as one.
+MOST_ROOMS = {"robustness": 8, "kernels": 7, "solvers": 6}
 # Packages that only some rooms may import.
 RESERVED = {
     "mujoco": {"hands", "simulation", "squeezing", "evaluation", "viewer"},
@@ -122,6 +123,48 @@ def test_a_wrong_import_is_seen(room, source):
 )
 def test_a_right_import_passes(room, source):
     assert violations(room, imports(source, f"jaxgrasp.{room}")) == []
+
+
+def rooms_in(folder: Path) -> dict[str, list[Path]]:
+    """The files of every room of a folder: of a module itself, of a folder all that is in it."""
+    rooms: dict[str, list[Path]] = {}
+    for path in sorted(folder.rglob("*.py")):
+        name = path.relative_to(folder).parts[0].removesuffix(".py")
+        if name not in ("__init__", "__main__"):
+            rooms.setdefault(name, []).append(path)
+    return rooms
+
+
+def circle_in(arrows: dict[str, set[str]]) -> dict[str, set[str]]:
+    """What is left of the arrows when rooms that import no other one are taken out again and again."""
+    left = dict(arrows)
+    while free := [name for name, to in left.items() if not to & left.keys()]:
+        for name in free:
+            del left[name]
+    return {name: to & left.keys() for name, to in left.items()}
+
+
+FOLDERS = sorted({path.parent for path in PACKAGE.rglob("*.py")} - {PACKAGE})
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.relative_to(PACKAGE).as_posix())
+def test_a_folder_has_floors_of_its_own(folder):
+    rooms, base = rooms_in(folder), module_of(folder / "__init__.py")
+    arrows: dict[str, set[str]] = {name: set() for name in rooms}
+    for name, paths in rooms.items():
+        for path in paths:
+            package = module_of(path) if path.name == "__init__.py" else module_of(path).rpartition(".")[0]
+            inside = [
+                i.removeprefix(f"{base}.") for i in imports(path.read_text(), package) if i.startswith(f"{base}.")
+            ]
+            arrows[name] |= {i.split(".")[0] for i in inside} & rooms.keys() - {name}
+    assert circle_in(arrows) == {}
+    assert len(rooms) <= MOST_ROOMS.get(folder.name, len(rooms))
+
+
+def test_a_circle_is_seen():
+    assert circle_in({"a": {"b"}, "b": {"c"}, "c": set()}) == {}
+    assert circle_in({"a": {"b"}, "b": {"a"}, "c": {"a"}, "d": set()}) == {"a": {"b"}, "b": {"a"}, "c": {"a"}}
 
 
 @pytest.mark.parametrize("module", ["solvers", "robustness.auditing", "ranking"])

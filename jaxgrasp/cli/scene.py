@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -103,12 +103,11 @@ class GivenScene(HandScene):
         Raises:
             CommandError: The files or the scene cannot be used, or no configuration is left.
         """
-        from jaxgrasp.cli.hand_grasps import candidates_of_grasps
         from jaxgrasp.cli.report import counting_bar
         from jaxgrasp.ranking.configurations import candidates_of, kept, trimmed
 
         if self.hand:
-            found, hands = candidates_of_grasps(self, friction, max_force, skipped if self.keep_going else None)
+            found, hands = self._of_files(friction, max_force, skipped if self.keep_going else None)
         else:
             hands = [self.hand_object(friction, max_force)]
             columns: dict[str, np.ndarray] = {}
@@ -141,6 +140,46 @@ class GivenScene(HandScene):
                 f"{self.min_contacts} contacts, {deep:,} deeper than {1e3 * self.max_penetration:g} mm"
             )
         return trimmed(found.take(np.flatnonzero(left))), hands
+
+    def _of_files(
+        self, friction: float | None, max_force: float | None, skipped: Skipped | None
+    ) -> "tuple[Candidates, list[HandObject]]":
+        """The candidates of all files of grasps, in their order, and the scenes that they are of, one a scale."""
+        from jaxgrasp.candidates import concatenate
+        from jaxgrasp.cli.hand_grasps import configurations, grasps_of_files, sources_of, travelling_columns
+        from jaxgrasp.cli.report import counting_bar
+        from jaxgrasp.ranking.configurations import candidates_of
+
+        assert self.object is not None
+        grasps = grasps_of_files(self.grasps, self.grasp_format, hand=self.hand, scale=self.scale, skipped=skipped)
+        hands: list[HandObject] = []
+        parts, order = [], []
+        with counting_bar("finding contacts", len(grasps)) as progress:
+            done = 0
+            for scale in np.unique(grasps.object_scale):
+                built = self.built(self.object, float(scale), friction)
+                rows = np.flatnonzero(grasps.object_scale == scale)
+                chosen = grasps.take(rows)
+                qpos = configurations(built, chosen)
+                # Tables have no names of joints: theirs are in the hand's order.
+                chosen = chosen.for_hand(built.joint_names)
+                hands.append(self.hand_of(built.model, None, max_force))
+                parts.append(
+                    candidates_of(
+                        hands[-1],
+                        qpos,
+                        source="",
+                        limited=self.actuators,
+                        columns=travelling_columns(chosen) | {"scene": np.full(len(rows), len(hands) - 1)},
+                        engine=self.engine,
+                    )
+                )
+                order.append(rows)
+                done += len(rows)
+                progress(done)
+        found = concatenate(parts).take(np.argsort(np.concatenate(order)))
+        files, source, index = sources_of(grasps)
+        return replace(found, sources=files, source=source, index=index), hands
 
     def _sampled(self, hand: "HandObject") -> np.ndarray:
         raise CommandError("--scene: got no --qpos; wanted configurations of it")
