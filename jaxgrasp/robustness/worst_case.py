@@ -36,6 +36,9 @@ def worst_case(
 ) -> tuple[Float[Array, "*batch contacts edges"], Float[Array, "*batch contacts"]]:
     """S_1 (17) and S_2 (18): what the worst unit disturbance takes from every row of C f <= -d and -E f <= f_max.
 
+    The rows of (19) are then C f_0 - S_1 lambda <= -d, which the paper prints with + for -, and
+    -E f_0 + S_2 lambda <= f_max.
+
     Args:
         contacts: the grasps.
         disturbances: the set D, object frame.

@@ -174,7 +174,8 @@ def specified_disturbances(
 
     G f_0 = b, G delta f_j = -W_j, f_0 and every f_0 + delta f_j admissible. Equation (6) asks for Coulomb's cones and
     bounds |f|, (9)-(10) for the inscribed pyramids and bound |f_n|. So (9) implies (6) only where (6) bounds |f_n| too
-    (force_bound = "normal"), or where (9) is given f_max / sqrt(1 + mu^2).
+    (force_bound = "normal"), or where (9) is given f_max / sqrt(1 + mu^2); with the norm of (6), as printed, it does
+    not.
 
     Args:
         contacts: the grasps; their dtype is the precision.

@@ -84,7 +84,8 @@ def formulation_margin(
     "per_direction" is the measure of the largest disturbance polytope: the smallest over the directions of max lambda
     with G f = b - lambda W_j. (13) and (12) fall apart in the same way, since f_0 + delta f_j is then free, provided
     that some admissible f_0 exists. "per_direction_prestrained" asks every direction for its own admissible f_0, to
-    which the blocking forces add.
+    which the blocking forces add. (16) and (19), the rows of (21), are equivalent for lambda >= 0: a row holds for all
+    directions if it holds for the worst.
 
     Args:
         contacts: the grasps; their dtype is the precision.

@@ -37,6 +37,10 @@ def largest_disturbance(
 
     max lambda over (f_0, lambda) subject to G f_0 = b, C f_0 - S_1 lambda <= -d, -E f_0 + S_2 lambda <= f_max.
 
+    The rows are those of (19), which the paper prints with + for the first -; they are equivalent to (16). They bound
+    |f_n|, where the paper's section V-A speaks of the force norm: f_max / sqrt(1 + mu^2) keeps |f| below f_max, too.
+    docs/paper.md has what that changes.
+
     lambda is left free: where even b cannot be borne the status is INFEASIBLE and a negative margin is the proof. A
     grasp without force closure and without load has margin 0.
 
