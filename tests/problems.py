@@ -273,3 +273,13 @@ def group(name: str) -> Group:
             families |= real_grasps(n_d)
     names = np.concatenate([np.full(len(b), key) for key, b in families.items()])
     return Group(cone_edges=edges, family=names, batch=concatenate(list(families.values())))
+
+
+LANES_A_FAMILY = 8
+SAMPLED = ("plain", "around", "light load", "uneven", "one side", "torques")
+
+
+def sample(name: str = "4 contacts", families=SAMPLED, count: int = LANES_A_FAMILY) -> Batch:
+    """The first lanes of some families; always the same shape, so that its program is compiled once."""
+    known = group(name)
+    return concatenate([known.batch[np.flatnonzero(known.family == f)[:count]] for f in families])

@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 import pytest
+from pictures import has_context
 
 from jaxgrasp.cli import main
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.scene import Scene
-from jaxgrasp.hands import scenes
-from jaxgrasp.viewer import offscreen
 
 COUNT = 48
 
@@ -29,14 +28,6 @@ def sampled(folder) -> pyarrow.parquet.ParquetFile:
             main(["rank", "--scene", "four_fingers", "--samples", str(COUNT), "--min-contacts", "0", "--top", "6"]) == 0
         )
     return pyarrow.parquet.read_table(folder / "ranking.parquet")
-
-
-def has_context() -> bool:
-    try:
-        with offscreen.offscreen(scenes.four_fingers().compile(), 16, 16):
-            return True
-    except RuntimeError:
-        return False
 
 
 def test_table_has_what_the_hand_does(sampled):

@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 import jaxgrasp as jg
 from jaxgrasp.contact.friction import pyramid_facets
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "paper.md"
 ROWS = [[cell.strip() for cell in line.split("|")[1:-1]] for line in PAGE.read_text().splitlines() if line[:2] == "| "]
 TABLE = [row for row in ROWS if len(row) == 4 and row[0] != "paper"]
@@ -53,7 +53,7 @@ def test_every_row_names_a_place_and_a_test():
 @pytest.mark.parametrize("name", TESTS)
 def test_the_tests_exist(name):
     file, *inner = name.split("::")
-    body = ast.parse((ROOT / "tests" / f"{file}.py").read_text()).body
+    body = ast.parse(next((ROOT / "tests").rglob(f"{file}.py")).read_text()).body
     for part in inner:
         found = [node for node in body if getattr(node, "name", None) == part]
         assert found, name

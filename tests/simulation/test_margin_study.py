@@ -10,7 +10,7 @@ import pytest
 import jaxgrasp as jg
 from jaxgrasp.contact.friction import pyramid_facets
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import margin_study  # noqa: E402
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import jaxgrasp as jg  # noqa: E402
 from benchmarks import squeeze  # noqa: E402

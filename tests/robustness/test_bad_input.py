@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
-from test_identities import sample
+from problems import sample
 
 import jaxgrasp as jg
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.assaults.grasp_samples import (  # noqa: E402
     COUNT,
@@ -30,7 +30,7 @@ from jaxgrasp.storage import FileError  # noqa: E402
 
 # The rotations of float32 files have rounding of 1e-7; poses are compared as matrices.
 CLOSE = 3e-7
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def need(name: str) -> None:

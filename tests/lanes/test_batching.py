@@ -12,7 +12,7 @@ import numpy as np
 import problems
 import pytest
 from jax.sharding import Mesh, PartitionSpec
-from test_identities import sample
+from problems import sample
 
 import jaxgrasp as jg
 from jaxgrasp.compiling import compiled

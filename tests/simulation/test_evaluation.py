@@ -18,7 +18,7 @@ from jaxgrasp.hands.hand_files import hand_spec
 from jaxgrasp.hands.servos import ARMATURE, DAMPING, FRICTION, with_servos
 from jaxgrasp.simulation import PROTOCOLS, trial_scene
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 # rad: base, flex1 and flex2 of fingers whose tips touch a ball of 5 cm, and how much farther they squeeze.
 BENT, SQUEEZE = (0.0, -0.165, 1.124), (0.0, 0.35, 0.0)
 

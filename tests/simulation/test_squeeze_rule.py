@@ -20,7 +20,7 @@ from jaxgrasp.hands.servos import servo_commands
 from jaxgrasp.hands.softness import depths
 from jaxgrasp.hands.squeeze_rule import first_to_touch
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 BENT = (0.0, -0.165, 1.124)
 # N, what servos that move and contacts that give way may make of a force.
 NEAR = 0.15

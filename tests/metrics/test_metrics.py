@@ -17,7 +17,7 @@ from jaxgrasp import metrics
 from jaxgrasp.candidates import sample_grasps
 from jaxgrasp.metrics import METRICS, Setting, WrenchSpace
 
-YCB = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "ycb_allegro_grasps.npz"
+YCB = Path(__file__).resolve().parents[3] / "shared" / "data" / "ycb_allegro_grasps.npz"
 COUNT, EDGES = 24, 4
 MU = 0.6
 # The linear programs are solved to 1e-9 in units of order one, HiGHS to 1e-7 and better.

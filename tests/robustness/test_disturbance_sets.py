@@ -10,7 +10,8 @@ import numpy as np
 import oracles
 import problems
 import pytest
-from test_identities import SAME_MARGIN, sample
+from problems import sample
+from test_identities import SAME_MARGIN
 
 import jaxgrasp as jg
 

@@ -11,14 +11,14 @@ import pytest
 from test_files import same, table
 from test_grasp_formats import need
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.assaults.grasp_samples import HAND, SAMPLES, matrices, of_palm, truth  # noqa: E402
 from jaxgrasp.cli import main  # noqa: E402
 from jaxgrasp.files import GraspSet, read_grasps, write_grasps  # noqa: E402
 from jaxgrasp.files import frames as f  # noqa: E402
 
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 @pytest.fixture

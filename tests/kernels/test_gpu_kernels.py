@@ -18,7 +18,7 @@ import problems
 import pytest
 from jax import lax
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import jaxgrasp as jg  # noqa: E402
 from benchmarks import gpu_kernels  # noqa: E402
 from jaxgrasp import kernels  # noqa: E402

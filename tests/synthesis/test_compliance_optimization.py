@@ -13,7 +13,7 @@ import jaxgrasp as jg
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.synthesis import optimize_compliance
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.suite import problems  # noqa: E402
 from benchmarks.suite.unreduced import unreduced_margins  # noqa: E402

@@ -17,7 +17,7 @@ from jaxgrasp.cli import main, setting
 from jaxgrasp.cli import rank as rank_command
 from jaxgrasp.solvers.status import Status
 
-YCB = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "ycb_allegro_grasps.npz"
+YCB = Path(__file__).resolve().parents[3] / "shared" / "data" / "ycb_allegro_grasps.npz"
 
 
 @pytest.fixture

@@ -22,15 +22,6 @@ STATIONARITY = 1e-6
 KAPPA = 1e-4
 """What s z is in a row of the smoothed program, in units of the margin."""
 
-LANES_A_FAMILY = 8
-FAMILIES = ("plain", "around", "light load", "uneven", "one side", "torques")
-
-
-def sample(name: str = "4 contacts", families=FAMILIES, count: int = LANES_A_FAMILY) -> problems.Batch:
-    """The first lanes of some families; always the same shape, so that its program is compiled once."""
-    group = problems.group(name)
-    return problems.concatenate([group.batch[np.flatnonzero(group.family == f)[:count]] for f in families])
-
 
 def solve(batch: problems.Batch, cone_edges: int = 8):
     return harness.as_numpy(harness.largest(*harness.data_of(batch), cone_edges=cone_edges))
@@ -48,7 +39,7 @@ def unit_of(batch: problems.Batch, *margins: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def batch() -> problems.Batch:
-    return sample()
+    return problems.sample()
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +52,7 @@ def assert_same(batch: problems.Batch, ours: np.ndarray, other: np.ndarray) -> N
 
 
 def test_a_smoothed_margin_is_below_the_exact_one_by_kappa_a_row_at_most():
-    contacts, forces = harness.data_of(sample(families=("plain", "around")))[:2]
+    contacts, forces = harness.data_of(problems.sample(families=("plain", "around")))[:2]
     exact = jg.largest_disturbance(contacts, forces)
     smooth = jg.largest_disturbance(contacts, forces, smoothing=KAPPA)
     assert (smooth.status == exact.status).all()
@@ -149,7 +140,7 @@ def test_absent_contacts_are_as_if_they_had_never_been_there(batch):
 def test_without_force_closure_the_margin_is_zero():
     # All normals within 30 degrees of one axis and all forces within 17 degrees of a normal: nothing pushes back.
     rng = np.random.default_rng(3)
-    batch = sample()
+    batch = problems.sample()
     tilt, turn = rng.uniform(0, np.pi / 6, batch.friction.shape), rng.uniform(0, 2 * np.pi, batch.friction.shape)
     normals = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=-1)
     hand = replace(
@@ -191,7 +182,7 @@ def test_a_reserve_in_the_cones_never_helps(batch, plain):
 
 @pytest.mark.parametrize("cone_edges", [3, 5, 16])
 def test_other_numbers_of_edges(cone_edges):
-    batch = sample(count=2)
+    batch = problems.sample(count=2)
     truth = np.array([a.margin for a in truths(batch, cone_edges)])
     assert_same(batch, solve(batch, cone_edges).margin, truth)
 
@@ -204,7 +195,7 @@ def compliances(rng, lanes: int, n_c: int, n_d: int, kind: str) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["blocks", "full", "per direction"])
 def test_compliances(kind):
-    batch = sample(families=("around", "light load"), count=6)
+    batch = problems.sample(families=("around", "light load"), count=6)
     Q = compliances(np.random.default_rng(5), len(batch), 4, 12, kind)
     contacts, disturbances, load, _ = harness.data_of(batch)
     ours = jg.largest_disturbance(
@@ -224,7 +215,7 @@ def test_compliances(kind):
 
 @pytest.mark.parametrize("kind", [None, "blocks", "full", "per direction"])
 def test_blocking_forces_balance_the_disturbance_with_least_norm(kind):
-    batch = sample(families=("around", "light load"), count=6)
+    batch = problems.sample(families=("around", "light load"), count=6)
     wrenches = np.random.default_rng(6).normal(size=(len(batch), 12, 6)) * np.repeat([1.0, 0.05], 3)
     Q = None if kind is None else compliances(np.random.default_rng(7), len(batch), 4, 12, kind)
     given = None if Q is None else jnp.asarray(Q)
@@ -288,7 +279,7 @@ def test_the_required_wrench_is_that_of_a_rigid_body():
 
 
 def test_effort_weights():
-    batch = sample(families=("around", "light load"), count=6)
+    batch = problems.sample(families=("around", "light load"), count=6)
     margins = solve(batch).margin
     weights = compliances(np.random.default_rng(10), len(batch), 4, 0, "blocks")
     margin = 0.5 * np.maximum(margins, 0)

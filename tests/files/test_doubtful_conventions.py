@@ -10,7 +10,7 @@ import pytest
 from jaxgrasp.candidates import doubtful_conventions, read_candidates, sample_grasps
 from jaxgrasp.cli import main
 
-YCB = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "ycb_allegro_grasps.npz"
+YCB = Path(__file__).resolve().parents[3] / "shared" / "data" / "ycb_allegro_grasps.npz"
 GRASPS = sample_grasps(60, seed=2)
 FRICTION = {"friction": 0.6, "max_force": 5.0}
 

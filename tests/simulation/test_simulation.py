@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from pictures import has_context
 from PIL import Image
-from test_rank_scene import has_context
 
 import jaxgrasp as jg
 from jaxgrasp.hands import HandObject

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.assaults.hostile_pickles import CALLS, CANARY, RAW, Call  # noqa: E402
 from benchmarks.assaults.torch_sample import torch_file  # noqa: E402
