@@ -11,6 +11,7 @@ import pytest
 
 from jaxgrasp.kernels.code import llvm as machine
 from jaxgrasp.kernels.cpu import module as cpu
+from jaxgrasp.kernels.store import folder
 
 _NUMBERS = itertools.count()
 
@@ -46,8 +47,8 @@ def compiled_for(target: machine.Machine) -> Iterator[list[str]]:
     jax.clear_caches()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(machine, "machine", lambda: spoilt)
-        patch.setattr(machine, "cached", lambda _: None)
-        patch.setattr(machine, "keep", lambda *_: None)
+        patch.setattr(folder, "cached", lambda _: None)
+        patch.setattr(folder, "keep", lambda *_: None)
         patch.setattr(cpu, "module", recorded)
         yield texts
     jax.clear_caches()

@@ -136,11 +136,11 @@ print(float(out.sum()))
             "has no fused multiply-add",
         ),
         (
-            "from jaxgrasp.kernels import cpu\n"
+            "from jaxgrasp.kernels.cpu import module as cpu\n"
             "cpu.HANDLER = cpu.HANDLER.replace('uge i64 %api.size, 152', 'uge i64 %api.size, 9999')",
             "hands arrays over in another way",
         ),
-        ("from jaxgrasp.kernels import cpu; cpu.HANDLER += 'nonsense'", "does not compile"),
+        ("from jaxgrasp.kernels.cpu import module as cpu; cpu.HANDLER += 'nonsense'", "does not compile"),
     ],
 )
 def test_where_there_are_none_one_warning_says_why(before, why, tmp_path):
@@ -179,7 +179,7 @@ def test_kernels_are_kept_on_disk(tmp_path):
     folder = tmp_path / "jaxgrasp" / "kernels"
     kept = sorted(folder.iterdir())
     assert len(kept) == 3 and folder.stat().st_mode & 0o077 == 0
-    no_compiling = "from jaxgrasp.kernels import machine; machine.compiled = None"
+    no_compiling = "from jaxgrasp.kernels.code import llvm; llvm.compiled = None"
     assert run(no_compiling + SMALL, XDG_CACHE_HOME=str(tmp_path)).stdout.strip() == "12.0"
     # What is cut short, belongs to another key, or could come from others, is not used.
     whole = [file.read_bytes() for file in kept]
