@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxgrasp.kernels.code.instructions import Instructions
-from jaxgrasp.kernels.program.expressions import Value
+from jaxgrasp.kernels.program.expressions import Address, Value
 from jaxgrasp.kernels.program.lowering import Guard, Loop
 
 _INTEGERS = {"add": "add", "sub": "sub", "mul": "mul"}
@@ -118,10 +118,9 @@ class ValueCode(Instructions, ABC):
             other, a = (self.negative(other), a) if first else (other, self.negative(a))
         return self.multiply_add(a, b, other)
 
-    def offset(self, index: tuple) -> str:
-        """Which entry of an array: a known one, or so many strides further as a counter says."""
-        known, counter, stride = index
-        if counter is None:
-            return str(known)
-        moved = self.emit(f"mul i64 {self.operand(counter, 'u')}, {stride}")
-        return self.emit(f"add i64 {moved}, {known}")
+    def offset(self, address: Address) -> str:
+        """The number of the entry at an address: known, or so many strides further as a counter says."""
+        if address.counter is None:
+            return str(address.offset)
+        moved = self.emit(f"mul i64 {self.operand(address.counter, 'u')}, {address.stride}")
+        return self.emit(f"add i64 {moved}, {address.offset}")

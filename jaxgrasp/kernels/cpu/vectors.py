@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxgrasp.kernels.code.values import ValueCode
 from jaxgrasp.kernels.cpu.registers import Registers
-from jaxgrasp.kernels.program.expressions import Value
+from jaxgrasp.kernels.program.expressions import Address, Value
 from jaxgrasp.kernels.program.lowering import Guard, Loop
 from jaxgrasp.kernels.program.schedule import Schedule, in_memory
 
@@ -199,10 +199,10 @@ class VectorCode(ValueCode):
         for event in self.registers.schedule.events[number + 1 :]:
             for value in event.uses:
                 if value.op == "own":
-                    argument, (entry, counter, _) = value.args
-                    entries = [entry] if counter is None else range(self.sizes[argument])
-                    for each in entries:
-                        add(self.own[argument], value.kind, each)
+                    at = value.address
+                    entries = [at.offset] if at.counter is None else range(self.sizes[at.buffer])
+                    for entry in entries:
+                        add(self.own[at.buffer], value.kind, entry)
                 elif value.op == "result":
                     step, index = value.args
                     if step in self.slots:
@@ -234,26 +234,26 @@ class VectorCode(ValueCode):
     def read(self, value: Value) -> str:
         """A value that lies in memory."""
         if value.op == "own":
-            return self.load_own(value.kind, *value.args)
+            return self.load_own(value.kind, value.address)
         if value.op == "shared":
-            return self.load_shared(value.kind, *value.args)
+            return self.load_shared(value.kind, value.address)
         step, index = value.args
         return self.load(value.kind, self.slots[step][index])
 
     # Memory
 
-    def place(self, index: tuple, unit: str, base: str) -> str:
-        """Address of an entry."""
-        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {self.offset(index)}")
+    def place(self, address: Address, unit: str, base: str) -> str:
+        """Write a pointer to an entry of the argument that begins at `base`."""
+        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {self.offset(address)}")
 
-    def load_own(self, kind: str, number: int, index: tuple) -> str:
-        """A different number for every lane."""
-        return self.load(kind, self.place(index, self.kept[kind], self.own[number]))
+    def load_own(self, kind: str, address: Address) -> str:
+        """Load a scalar of an argument that every lane has for itself."""
+        return self.load(kind, self.place(address, self.kept[kind], self.own[address.buffer]))
 
-    def load_shared(self, kind: str, number: int, index: tuple) -> str:
-        """The same number for all lanes."""
+    def load_shared(self, kind: str, address: Address) -> str:
+        """Load a scalar of an argument that all lanes share, and copy it to all lanes."""
         unit = {"f": self.scalar, "i": "i32", "b": "i8"}[kind]
-        one = self.emit(f"load {unit}, ptr {self.place(index, unit, self.shared[number])}")
+        one = self.emit(f"load {unit}, ptr {self.place(address, unit, self.shared[address.buffer])}")
         if kind == "b":
             one, unit = self.emit(f"icmp ne i8 {one}, 0"), "i1"
         vector = self.types[kind]

@@ -126,7 +126,7 @@ def module(program: Program, name: str) -> str:
         if type(value) is not Value:
             name = code.constant(value, kind)
         name = code.emit(f"zext i1 {name} to i8") if kind == "b" else name
-        place = code.place((entry, None, 0), _unit(code, kind), start)
+        place = code.emit(f"getelementptr {_unit(code, kind)}, ptr addrspace(1) {start}, i64 {entry}")
         code.do(f"store {_unit(code, kind)} {name}, ptr addrspace(1) {place}")
 
     code.write(scheduled(program), store)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxgrasp.kernels.code.values import ValueCode
-from jaxgrasp.kernels.program.expressions import Unsupported, Value
+from jaxgrasp.kernels.program.expressions import Address, Unsupported, Value
 from jaxgrasp.kernels.program.lowering import Guard, Loop
 from jaxgrasp.kernels.program.schedule import Schedule, in_memory
 
@@ -185,12 +185,11 @@ class ThreadCode(ValueCode):
         if value.op in ("carry", "result"):
             step, index = value.args
             return self.slots[step][index]
-        number, index = value.args
         unit = {"f": self.scalar, "i": "i32", "b": "i8"}[value.kind]
-        place = self.place(index, unit, self.own[number])
+        place = self.place(value.address, unit, self.own[value.address.buffer])
         found = self.emit(f"load {unit}, ptr addrspace(1) {place}")
         return self.emit(f"icmp ne i8 {found}, 0") if value.kind == "b" else found
 
-    def place(self, index: tuple, unit: str, base: str) -> str:
-        """Address of an entry."""
-        return self.emit(f"getelementptr {unit}, ptr addrspace(1) {base}, i64 {self.offset(index)}")
+    def place(self, address: Address, unit: str, base: str) -> str:
+        """Write a pointer to an entry of the argument or result that begins at `base`."""
+        return self.emit(f"getelementptr {unit}, ptr addrspace(1) {base}, i64 {self.offset(address)}")

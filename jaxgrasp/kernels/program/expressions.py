@@ -6,7 +6,7 @@ not change in a loop is computed before it.
 """
 
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -32,6 +32,21 @@ class Region:
         return self.parent
 
 
+class Address(NamedTuple):
+    """Where a scalar of an argument lies: entry `offset + counter * stride` of a row of the argument.
+
+    buffer: number of the argument.
+    offset: number of the entry in the flattened row, where there is no counter or it is zero.
+    counter: the counter of a loop that the entry depends on; None where the entry is always the same.
+    stride: entries from one round of the loop to the next.
+    """
+
+    buffer: int
+    offset: int
+    counter: "Value | None" = None
+    stride: int = 0
+
+
 @final
 class Value:
     """A scalar that is computed: an operation, its operands, its type and its region.
@@ -46,6 +61,11 @@ class Value:
         """A new value."""
         self.op, self.args, self.kind, self.region = op, args, kind, region
         self.serial = Value.count = Value.count + 1
+
+    @property
+    def address(self) -> Address:
+        """Where the scalar lies; only "own" and "shared" have an address."""
+        return self.args[0]
 
 
 _COMMUTE = {"add", "mul", "max", "min", "and", "or", "eq", "ne"}
@@ -133,9 +153,9 @@ class Builder:
 
     def _home(self, args: tuple) -> Region:
         home, region = None, self.region
-        # Addresses in memory may depend on a counter.
-        index = args[1] if len(args) == 2 and isinstance(args[1], tuple) else ()
-        for x in (*args, *index):
+        for x in args:
+            # An address may depend on a counter, and then belongs to its loop.
+            x = x.counter if isinstance(x, Address) else x
             if type(x) is Value and (home is None or x.region.depth > home.depth):
                 home = x.region
         # The outermost region is the kernel's; guarded ones keep what is made in them.

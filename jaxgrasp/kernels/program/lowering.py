@@ -5,7 +5,6 @@ about (slices, transposes, gathers with known indices) costs nothing in the kern
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
 
 from jaxgrasp.kernels.program.entries import array, aval_of, kinds_of, known, objects
-from jaxgrasp.kernels.program.expressions import Builder, Region, Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.expressions import Address, Builder, Region, Unsupported, Value, kind_of
 from jaxgrasp.kernels.program.rules import ELEMENTWISE, RULES
 
 # Loops of at most so many rounds are spelt out: always, as the first round often starts from zeros and the last one
@@ -89,7 +88,7 @@ def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
         aval = aval_of(var)
         kind = kind_of(aval.dtype)
         loads = [
-            lowering.builder.value("shared" if is_shared else "own", (number, (i, None, 0)), kind)
+            lowering.builder.value("shared" if is_shared else "own", (Address(number, i),), kind)
             for i in range(math.prod(aval.shape))
         ]
         inputs.append(array(loads, aval.shape))
@@ -312,21 +311,26 @@ class _Lowering:
             for a, (s, n, k) in enumerate(zip(starts, x.shape, sizes, strict=True))
         ]
         first = x[tuple(slice(c, c + k) for c, k in zip(fixed, sizes, strict=True))]
-        source, stride = self.memory(x, axis)
+        stride = self.stride(x, axis)
         out = []
         for v in first.ravel():
-            op, (buffer, (offset, _, _)) = source(v)
-            out.append(self.builder.value(op, (buffer, (offset, starts[axis], stride)), v.kind))
+            moving = v.address._replace(counter=starts[axis], stride=stride)
+            out.append(self.builder.value(v.op, (moving,), v.kind))
         return array(out, first.shape)
 
-    def memory(self, x: np.ndarray, axis: int) -> tuple[Callable, int]:
-        """Where the entries of an array lie, and how far apart along an axis; they are put somewhere if need be."""
+    def stride(self, x: np.ndarray, axis: int) -> int:
+        """How far apart the entries of an array lie along an axis.
+
+        Raises:
+            Unsupported: the entries do not lie at equal distances in one argument, at addresses without a counter.
+        """
         flat = np.moveaxis(objects(x), axis, 0).reshape(x.shape[axis], -1)
-        if all(type(v) is Value and v.op in ("own", "shared") and v.args[1][1] is None for v in flat.flat):
-            offsets = np.array([v.args[1][0] for v in flat.flat]).reshape(flat.shape)
+        if all(type(v) is Value and v.op in ("own", "shared") and v.address.counter is None for v in flat.flat):
+            offsets = np.array([v.address.offset for v in flat.flat]).reshape(flat.shape)
             steps = np.diff(offsets, axis=0)
-            if len({(v.op, v.args[0]) for v in flat.flat}) == 1 and (not steps.size or (steps == steps.flat[0]).all()):
-                return (lambda v: (v.op, v.args)), int(steps.flat[0]) if steps.size else 0
+            buffers = {(v.op, v.address.buffer) for v in flat.flat}
+            if len(buffers) == 1 and (not steps.size or (steps == steps.flat[0]).all()):
+                return int(steps.flat[0]) if steps.size else 0
         raise Unsupported("a long loop over computed arrays")
 
 

@@ -110,7 +110,7 @@ def _spread(events: list[Event]) -> list[Event]:
 def operands(value: Value, fused: set[Value]) -> list[Value]:
     """What has to be known to compute a value: its operands, and where those lie that are in memory."""
     if value.op in ("own", "shared"):
-        return _values([value.args[1][1]])
+        return _values([value.address.counter])
     if value.op in ("carry", "result", "counter"):
         return []
     needed: list[Value] = []
@@ -126,7 +126,7 @@ def operands(value: Value, fused: set[Value]) -> list[Value]:
 
 def _addressed(values: list[Value]) -> list[Value]:
     """With what the addresses of those in memory depend on."""
-    far = [x.args[1][1] for x in values if x.op in ("own", "shared")]
+    far = [x.address.counter for x in values if x.op in ("own", "shared")]
     return values + _values(far) if far else values
 
 
