@@ -122,7 +122,7 @@ class Builder:
         if not any(type(x) is Value for x in args):
             with np.errstate(all="ignore"):
                 return self._constant(op, args)
-        simple = self._simplified(op, args)
+        simple = _SIMPLIFY[op](self, *args) if op in _SIMPLIFY else None
         if simple is not None:
             return simple
         if op in _COMMUTE and _order(args[0]) > _order(args[1]):
@@ -172,79 +172,122 @@ class Builder:
             return (1 / np.sqrt(args[0])).astype(args[0].dtype)
         return _FOLD[op](*args)
 
-    def _simplified(self, op: str, args: tuple[Any, ...]) -> Any:
-        """Cheaper forms; a product with zero is zero, whatever the other factor."""
-        if op in ("add", "sub", "mul", "div"):
-            a, b = args
-            left, right = type(a) is not Value, type(b) is not Value
-            if op == "mul":
-                for x, y, known in ((a, b, left), (b, a, right)):
-                    if not known:
-                        continue
-                    number: np.generic = x
-                    if number in (0, 1, -1):
-                        zero = number.dtype.type(0)
-                        return x * zero if number == 0 else y if number == 1 else self.make("neg", y)
-                # Signs go outwards, where a sum takes them up.
-                for x, y in ((a, b), (b, a)):
-                    if type(x) is Value and x.op == "neg":
-                        return self.make("neg", self.make("mul", x.args[0], y))
-                    if type(x) is not Value and x < 0:
-                        return self.make("neg", self.make("mul", -x, y))
-                    if type(x) is not Value and y.kind == "f" and y.op == "mul" and type(y.args[0]) is not Value:
-                        both = x * y.args[0]
-                        if np.isfinite(both) and abs(both) >= np.finfo(both.dtype).tiny:
-                            return self.make("mul", both, y.args[1])
-            elif op == "add":
-                if left and a == 0:
-                    return b
-                if right and b == 0:
-                    return a
-                if not right and b.op == "neg":
-                    return self.make("sub", a, b.args[0])
-                if not left and a.op == "neg":
-                    return self.make("sub", b, a.args[0])
-            elif op == "sub":
-                if right and b == 0:
-                    return a
-                if left and a == 0:
-                    return self.make("neg", b)
-                if not right and b.op == "neg":
-                    return self.make("add", a, b.args[0])
-                if not left and a.op == "neg":
-                    return self.make("neg", self.make("add", a.args[0], b))
-            elif right and b != 0 and np.isfinite(b):
-                return self.make("mul", a, (1 / b).astype(b.dtype))
-            elif not (left and a == 1):
-                # The reciprocal may be had already, or before a loop.
-                return self.make("mul", a, self.make("div", self.dtype.type(1), b))
-        elif op == "neg" and args[0].op == "neg":
-            return args[0].args[0]
-        elif op == "neg" and args[0].op == "sub":
-            return self.make("sub", args[0].args[1], args[0].args[0])
-        elif op == "not" and args[0].op == "not":
-            return args[0].args[0]
-        elif op in ("and", "or"):
-            for x, y in (args, args[::-1]):
-                if type(x) is not Value:
-                    return (y if x else x) if op == "and" else (x if x else y)
-            if args[0] is args[1]:
-                return args[0]
-        elif op == "select":
-            if type(args[0]) is not Value:
-                return args[1] if args[0] else args[2]
-            if args[1] is args[2]:
-                return args[1]
-            inner = args[1]
-            if type(inner) is Value and inner.op == "select" and inner.args[2] is args[2]:
-                return self.make("select", self.make("and", args[0], inner.args[0]), inner.args[1], args[2])
-        elif op in ("max", "min"):
-            if args[0] is args[1]:
-                return args[0]
-            if all(type(x) is Value and x.op == "neg" for x in args):
-                other = "min" if op == "max" else "max"
-                return self.make("neg", self.make(other, args[0].args[0], args[1].args[0]))
+
+def _simplify_product(builder: Builder, a: Any, b: Any) -> Any:
+    for x, y in ((a, b), (b, a)):
+        if type(x) is not Value and x in (0, 1, -1):
+            zero = x.dtype.type(0)
+            # Zero times anything is zero, infinity and NaN included.
+            return x * zero if x == 0 else y if x == 1 else builder.make("neg", y)
+    for x, y in ((a, b), (b, a)):
+        # Signs go outwards, where a sum takes them up.
+        if type(x) is Value and x.op == "neg":
+            return builder.make("neg", builder.make("mul", x.args[0], y))
+        if type(x) is not Value and x < 0:
+            return builder.make("neg", builder.make("mul", -x, y))
+        if type(x) is not Value and y.kind == "f" and y.op == "mul" and type(y.args[0]) is not Value:
+            both = x * y.args[0]
+            if np.isfinite(both) and abs(both) >= np.finfo(both.dtype).tiny:
+                return builder.make("mul", both, y.args[1])
+    return None
+
+
+def _simplify_sum(builder: Builder, a: Any, b: Any) -> Any:
+    if _is(a, 0):
+        return b
+    if _is(b, 0):
+        return a
+    if _does(b, "neg"):
+        return builder.make("sub", a, b.args[0])
+    if _does(a, "neg"):
+        return builder.make("sub", b, a.args[0])
+    return None
+
+
+def _simplify_difference(builder: Builder, a: Any, b: Any) -> Any:
+    if _is(b, 0):
+        return a
+    if _is(a, 0):
+        return builder.make("neg", b)
+    if _does(b, "neg"):
+        return builder.make("add", a, b.args[0])
+    if _does(a, "neg"):
+        return builder.make("neg", builder.make("add", a.args[0], b))
+    return None
+
+
+def _simplify_quotient(builder: Builder, a: Any, b: Any) -> Any:
+    if type(b) is not Value and b != 0 and np.isfinite(b):
+        return builder.make("mul", a, (1 / b).astype(b.dtype))
+    if not _is(a, 1):
+        # The reciprocal may exist already, or be computed before a loop.
+        return builder.make("mul", a, builder.make("div", builder.dtype.type(1), b))
+    return None
+
+
+def _simplify_negation(builder: Builder, x: Value) -> Any:
+    if x.op == "neg":
+        return x.args[0]
+    if x.op == "sub":
+        return builder.make("sub", x.args[1], x.args[0])
+    return None
+
+
+def _simplify_logic(op: str) -> Callable[..., Any]:
+    def simplify(builder: Builder, a: Any, b: Any) -> Any:
+        for x, y in ((a, b), (b, a)):
+            if type(x) is not Value:
+                return (y if x else x) if op == "and" else (x if x else y)
+        return a if a is b else None
+
+    return simplify
+
+
+def _simplify_select(builder: Builder, condition: Any, a: Any, b: Any) -> Any:
+    if type(condition) is not Value:
+        return a if condition else b
+    if a is b:
+        return a
+    if _does(a, "select") and a.args[2] is b:
+        return builder.make("select", builder.make("and", condition, a.args[0]), a.args[1], b)
+    return None
+
+
+def _simplify_extremum(opposite: str) -> Callable[..., Any]:
+    def simplify(builder: Builder, a: Any, b: Any) -> Any:
+        if a is b:
+            return a
+        if _does(a, "neg") and _does(b, "neg"):
+            return builder.make("neg", builder.make(opposite, a.args[0], b.args[0]))
         return None
+
+    return simplify
+
+
+# Cheaper forms of operations of which at least one operand is not a constant; each returns None where it knows none.
+_SIMPLIFY: dict[str, Callable[..., Any]] = {
+    "mul": _simplify_product,
+    "add": _simplify_sum,
+    "sub": _simplify_difference,
+    "div": _simplify_quotient,
+    "neg": _simplify_negation,
+    "not": lambda builder, x: x.args[0] if x.op == "not" else None,
+    "and": _simplify_logic("and"),
+    "or": _simplify_logic("or"),
+    "select": _simplify_select,
+    "max": _simplify_extremum("min"),
+    "min": _simplify_extremum("max"),
+}
+
+
+def _is(x: Any, number: int) -> bool:
+    """Whether a scalar is this constant."""
+    return type(x) is not Value and bool(x == number)
+
+
+def _does(x: Any, op: str) -> bool:
+    """Whether a scalar is computed by this operation."""
+    return type(x) is Value and x.op == op
 
 
 def _kind(x: Any) -> str:
