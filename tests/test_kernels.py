@@ -136,8 +136,7 @@ print(float(out.sum()))
             "has no fused multiply-add",
         ),
         (
-            "from jaxgrasp.kernels.cpu import module as cpu\n"
-            "cpu.HANDLER = cpu.HANDLER.replace('uge i64 %api.size, 152', 'uge i64 %api.size, 9999')",
+            "from jaxgrasp.kernels.cpu import module as cpu\ncpu.API_BYTES = 9999\n",
             "hands arrays over in another way",
         ),
         ("from jaxgrasp.kernels.cpu import module as cpu; cpu.HANDLER += 'nonsense'", "does not compile"),

@@ -1,9 +1,20 @@
 """The handler that XLA calls, and how its threads share the blocks of a call: LLVM code around that of a block.
 
-The offsets are those of xla/ffi/api/c_api.h, version 0.3. Where a structure is smaller than what is read from it, the
-handler does nothing at all: the caller finds its results untouched. Whoever calls waits only for blocks that a running
-thread has taken; a thread that comes late finds none left, and the last one to leave frees the call's data.
+Where one of XLA's structures is smaller than what is read from it, the handler does nothing at all: the caller finds
+its results untouched. The calling thread waits only for blocks that a running thread has taken; a thread that comes
+late finds none left, and the last one to leave frees the call's state.
+
+The state of a call, which its threads share, is an array of words: the number of rows, of blocks, the next block, how
+many blocks are done, how many threads use the state, and how many blocks a thread takes at a time; then the pointers to
+the arguments' data and to the results'.
 """
+
+from jaxgrasp.kernels.code.ffi import Api
+
+# How much of `XLA_FFI_Api` the handler reads.
+API_BYTES = Api.THREAD_POOL_NUM_THREADS + 8
+# Where the pointers begin in the state of a call, in words.
+POINTERS = 6
 
 HANDLER = """
 declare ptr @malloc(i64)
@@ -73,51 +84,18 @@ define internal void @help(ptr %state) {
   call void @leave(ptr %state)
   ret void
 }
-
-define internal ptr @field(ptr %base, i64 %offset) alwaysinline {
-  %p = getelementptr i8, ptr %base, i64 %offset
-  %v = load ptr, ptr %p
-  ret ptr %v
-}
-
-define ptr @NAME@(ptr %frame) {
-entry:
-  %extension = call ptr @field(ptr %frame, i64 8)
-  %asked = icmp ne ptr %extension, null
-  br i1 %asked, label %describe, label %check
-describe:
-  %metadata = call ptr @field(ptr %extension, i64 24)
-  %major.p = getelementptr i8, ptr %metadata, i64 24
-  %minor.p = getelementptr i8, ptr %metadata, i64 28
-  store i32 0, ptr %major.p
-  store i32 3, ptr %minor.p
-  ret ptr null
-check:
-  %frame.size = load i64, ptr %frame
-  %api = call ptr @field(ptr %frame, i64 16)
-  %api.size = load i64, ptr %api
-  %api.major.p = getelementptr i8, ptr %api, i64 32
-  %api.major = load i32, ptr %api.major.p
-  %frame.fits = icmp uge i64 %frame.size, 120
-  %api.fits = icmp uge i64 %api.size, 152
-  %major.fits = icmp eq i32 %api.major, 0
-  %both = and i1 %frame.fits, %api.fits
-  %fits = and i1 %both, %major.fits
-  br i1 %fits, label %begin, label %nothing
-nothing:
-  ret ptr null
-begin:
+@PREAMBLE@
   %state = call ptr @malloc(i64 @STATE_BYTES@)
-  %arguments = call ptr @field(ptr %frame, i64 72)
-  %results = call ptr @field(ptr %frame, i64 112)
-  %context = call ptr @field(ptr %frame, i64 24)
+  %arguments = call ptr @field(ptr %frame, i64 @CallFrame.ARGUMENTS@)
+  %results = call ptr @field(ptr %frame, i64 @CallFrame.RESULTS@)
+  %context = call ptr @field(ptr %frame, i64 @CallFrame.CONTEXT@)
   br label %argument
 argument:
   %a = phi i64 [ 0, %begin ], [ %a.next, %argument ]
   %a.p = getelementptr ptr, ptr %arguments, i64 %a
   %a.buffer = load ptr, ptr %a.p
-  %a.data = call ptr @field(ptr %a.buffer, i64 24)
-  %a.place = add i64 %a, 6
+  %a.data = call ptr @field(ptr %a.buffer, i64 @Buffer.DATA@)
+  %a.place = add i64 %a, @POINTERS@
   %a.slot = getelementptr i64, ptr %state, i64 %a.place
   store ptr %a.data, ptr %a.slot
   %a.next = add i64 %a, 1
@@ -127,7 +105,7 @@ result:
   %r = phi i64 [ 0, %argument ], [ %r.next, %result ]
   %r.p = getelementptr ptr, ptr %results, i64 %r
   %r.buffer = load ptr, ptr %r.p
-  %r.data = call ptr @field(ptr %r.buffer, i64 24)
+  %r.data = call ptr @field(ptr %r.buffer, i64 @Buffer.DATA@)
   %r.place = add i64 %r, @FIRST_RESULT@
   %r.slot = getelementptr i64, ptr %state, i64 %r.place
   store ptr %r.data, ptr %r.slot
@@ -136,7 +114,7 @@ result:
   br i1 %r.more, label %result, label %share
 share:
   %first.buffer = load ptr, ptr %results
-  %dimensions = call ptr @field(ptr %first.buffer, i64 40)
+  %dimensions = call ptr @field(ptr %first.buffer, i64 @Buffer.DIMENSIONS@)
   %rows = load i64, ptr %dimensions
   %padded = add i64 %rows, @WIDTH@
   %almost = sub i64 %padded, 1
@@ -144,14 +122,14 @@ share:
   %count.p = alloca i64
   %question = alloca [4 x i64]
   store i64 1, ptr %count.p
-  store i64 32, ptr %question
+  store i64 @CallBytes.THREAD_POOL_NUM_THREADS@, ptr %question
   %question.1 = getelementptr i64, ptr %question, i64 1
   %question.2 = getelementptr i64, ptr %question, i64 2
   %question.3 = getelementptr i64, ptr %question, i64 3
   store i64 0, ptr %question.1
   store ptr %context, ptr %question.2
   store ptr %count.p, ptr %question.3
-  %threads.f = call ptr @field(ptr %api, i64 144)
+  %threads.f = call ptr @field(ptr %api, i64 @Api.THREAD_POOL_NUM_THREADS@)
   %error = call ptr %threads.f(ptr %question)
   %threads = load i64, ptr %count.p
   %alone = icmp slt i64 %threads, 1
@@ -180,12 +158,12 @@ share:
   %task.2 = getelementptr i64, ptr %task, i64 2
   %task.3 = getelementptr i64, ptr %task, i64 3
   %task.4 = getelementptr i64, ptr %task, i64 4
-  store i64 40, ptr %task
+  store i64 @CallBytes.THREAD_POOL_SCHEDULE@, ptr %task
   store i64 0, ptr %task.1
   store ptr %context, ptr %task.2
   store ptr @help, ptr %task.3
   store ptr %state, ptr %task.4
-  %schedule.f = call ptr @field(ptr %api, i64 136)
+  %schedule.f = call ptr @field(ptr %api, i64 @Api.THREAD_POOL_SCHEDULE@)
   br label %call
 call:
   %t = phi i64 [ 1, %share ], [ %t.next, %called ], [ %t.next, %refused ]

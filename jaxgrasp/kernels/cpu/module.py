@@ -8,7 +8,8 @@ import math
 from collections.abc import Callable
 
 from jaxgrasp.kernels.code import llvm as machine
-from jaxgrasp.kernels.cpu.handler import HANDLER, SPOIL
+from jaxgrasp.kernels.code.ffi import fill
+from jaxgrasp.kernels.cpu.handler import API_BYTES, HANDLER, POINTERS, SPOIL
 from jaxgrasp.kernels.cpu.vectors import VectorCode
 from jaxgrasp.kernels.cpu.waiting import blocks, waits
 from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
@@ -21,9 +22,6 @@ PLATFORM = "cpu"
 _MOST_STACK = 1 << 19
 # Blocks that a thread takes at a time, at most.
 _CHUNK = 16
-# A call's data that its threads share, in words: rows, blocks, next block, blocks done, users, blocks at a time; then
-# pointers to arguments and results.
-_POINTERS = 6
 
 
 def description() -> str:
@@ -71,25 +69,24 @@ def module(program: Program, name: str, width: int, *, estimates: bool, spoilt: 
     _unpacking(program, code, results)
     count = len(program.inputs) + len(program.outputs)
     values = {
-        "@NAME@": f"@{name}",
-        "@FUNCTIONS@": code.written(),
-        "@BLOCK@": blocks(code),
-        "@SPOIL@": SPOIL if spoilt else "",
-        "@FRAME_BYTES@": str(max(code.used, 64)),
-        "@REST_BYTES@": str(code.used if waits(code) else 64),
-        "@BOOK@": str(1 + 3 * width),
-        "@DECLARATIONS@": "\n".join(sorted(code.declarations)),
-        "@STATE_BYTES@": str(8 * (_POINTERS + count)),
-        "@ARGUMENTS@": str(len(program.inputs)),
-        "@RESULTS@": str(len(program.outputs)),
-        "@FIRST_RESULT@": str(_POINTERS + len(program.inputs)),
-        "@WIDTH@": str(width),
-        "@CHUNK@": str(_CHUNK),
+        "NAME": f"@{name}",
+        "API_BYTES": API_BYTES,
+        "FUNCTIONS": code.written(),
+        "BLOCK": blocks(code),
+        "SPOIL": SPOIL if spoilt else "",
+        "FRAME_BYTES": max(code.used, 64),
+        "REST_BYTES": code.used if waits(code) else 64,
+        "BOOK": 1 + 3 * width,
+        "DECLARATIONS": "\n".join(sorted(code.declarations)),
+        "STATE_BYTES": 8 * (POINTERS + count),
+        "POINTERS": POINTERS,
+        "ARGUMENTS": len(program.inputs),
+        "RESULTS": len(program.outputs),
+        "FIRST_RESULT": POINTERS + len(program.inputs),
+        "WIDTH": width,
+        "CHUNK": _CHUNK,
     }
-    text = HANDLER
-    for mark, value in values.items():
-        text = text.replace(mark, value)
-    return text
+    return fill(HANDLER, values)
 
 
 def _shared(program: Program, code: VectorCode) -> None:
@@ -175,7 +172,7 @@ def _unpacking(program: Program, code: VectorCode, results: list[tuple[str, int,
 
 
 def _pointer(code: VectorCode, number: int) -> str:
-    place = code.emit(f"getelementptr i64, ptr %state, i64 {_POINTERS + number}")
+    place = code.emit(f"getelementptr i64, ptr %state, i64 {POINTERS + number}")
     return code.emit(f"load ptr, ptr {place}")
 
 
