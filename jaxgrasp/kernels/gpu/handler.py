@@ -100,14 +100,14 @@ failed:
 _SAID = "jaxgrasp: the GPU's driver does not launch a kernel, CUDA error %d"
 
 
-def module(name: str, *, kernel: int, launch: int, threads: int) -> str:
-    """LLVM code of the handler `name`, for a kernel of all arguments and results of a call and the number of rows.
+def write_module(name: str, *, kernel: int, launch: int, threads: int) -> str:
+    """Write LLVM code of a handler that launches a kernel of all arguments and results and the number of rows.
 
     Args:
         name: of the handler.
-        kernel: the driver's handle.
+        kernel: the driver's handle of the kernel.
         launch: address of `cuLaunchKernel`.
-        threads: of a block.
+        threads: how many threads a block has.
     """
     values = {
         "NAME": f"@{name}",

@@ -1,8 +1,24 @@
-"""Scalar expressions: what a fused kernel computes, one problem at a time.
+"""The intermediate representation: scalar expressions, which a kernel computes for one lane of the batch.
 
 A `Value` is one operation on other values or constants. Equal operations are the same value, operations on constants
 are done at once, and a value belongs to the outermost region (a loop's body, say) that knows its operands: what does
 not change in a loop is computed before it.
+
+Operations and their `args`; an operand is a `Value` or a NumPy scalar, and the type is that of the result:
+
+- "own", "shared" (Address): a scalar of an argument that every lane has for itself, or that all lanes share.
+- "carry" (Loop, index): a scalar that a loop carries, at the beginning of a round.
+- "result" (Loop or Guard, index): a scalar that a loop or a guard leaves.
+- "counter" (): the number of the round of the loop in whose body it is, type "u".
+- "add", "sub", "mul", "max", "min" (a, b) and "neg" (a): types "f", "i" and "u".
+- "div" (a, b), "abs", "sqrt", "rsqrt" (1 / sqrt), "exp", "log", "floor" (a): type "f". `make` leaves 1 as the only
+  dividend.
+- "eq", "ne", "lt", "le", "gt", "ge" (a, b) and "is_finite" (a): type "b".
+- "and", "or", "xor" (a, b) and "not" (a): type "b".
+- "select" (condition, a, b): a where the condition holds, else b; the type of a and b.
+- "convert" (a): a number as an integer or an integer as a number, "f" or "i".
+
+The first five are read where they lie, the others are computed.
 """
 
 from collections.abc import Callable
@@ -12,14 +28,17 @@ import numpy as np
 
 
 class Region:
-    """Code that runs as a whole: a kernel, the body of a loop, or what only some problems need.
+    """Code that runs as a whole: a kernel, the body of a loop, or of a guard.
 
-    steps: what it does beside computing values (loops, stores), in order.
-    guarded: values stay inside even where they could be computed outside.
+    parent: the region around it; None for the kernel's own.
+    depth: how many regions are around it.
+    steps: the loops and guards in it, in order.
+    guarded: whether values stay inside even where they could be computed outside.
+    known: its values by operation and operands.
     """
 
     def __init__(self, parent: "Region | None", guarded: bool = False) -> None:
-        """A region inside another one."""
+        """Make an empty region inside another one."""
         self.parent, self.guarded = parent, guarded
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.steps: list[Any] = []
@@ -27,7 +46,7 @@ class Region:
 
     @property
     def outer(self) -> "Region":
-        """The region around it, which all have but the kernel's own."""
+        """The region around it; the kernel's own has none."""
         assert self.parent is not None
         return self.parent
 
@@ -49,16 +68,21 @@ class Address(NamedTuple):
 
 @final
 class Value:
-    """A scalar that is computed: an operation, its operands, its type and its region.
+    """A scalar that is computed, compared by identity.
 
-    Types: "f" a number, "i" an integer and "b" a truth value of every problem; "u" an integer that all problems share.
+    op: its operation, see the module.
+    args: the operands; what they are depends on the operation.
+    kind: its type: "f" a number, "i" an integer, "b" a truth value, all of them different in every lane; "u" an integer
+        that all lanes share.
+    region: the region that computes it.
+    serial: how many values were made before it, in this process.
     """
 
     __slots__ = ("args", "kind", "op", "region", "serial")
     count = 0
 
     def __init__(self, op: str, args: tuple, kind: str, region: Region) -> None:
-        """A new value."""
+        """Make a value; `Builder.value` does so only where there is none like it."""
         self.op, self.args, self.kind, self.region = op, args, kind, region
         self.serial = Value.count = Value.count + 1
 
@@ -98,11 +122,11 @@ _FOLD: dict[str, Callable[..., Any]] = {
 
 
 class Unsupported(Exception):
-    """Something that fused kernels cannot do."""
+    """A kernel cannot be made of the program; the message names the part of it that stands in the way."""
 
 
 def kind_of(dtype: Any) -> str:
-    """The type of a scalar of this dtype."""
+    """Return the type of a scalar of this dtype."""
     kinds = {"f": "f", "i": "i", "b": "b", "u": "i"}
     if np.dtype(dtype).kind not in kinds:
         raise Unsupported(f"values of type {dtype}")
@@ -110,15 +134,19 @@ def kind_of(dtype: Any) -> str:
 
 
 class Builder:
-    """Makes values, in the region that is current."""
+    """Makes values.
+
+    dtype: of numbers.
+    region: the region that is being written.
+    """
 
     def __init__(self, dtype: Any) -> None:
-        """For numbers of this type."""
+        """Begin a kernel with numbers of this dtype."""
         self.dtype = np.dtype(dtype)
         self.region = Region(None)
 
     def make(self, op: str, *args: Any) -> Any:
-        """The value of an operation, or the constant where that is known."""
+        """Return the value of an operation, in its cheapest form, or the constant where that is known."""
         if not any(type(x) is Value for x in args):
             with np.errstate(all="ignore"):
                 return self._constant(op, args)
@@ -139,7 +167,7 @@ class Builder:
         return self.value(op, args, kind)
 
     def value(self, op: str, args: tuple, kind: str) -> Value:
-        """A value that is not simplified."""
+        """Return the value of an operation as it is, new or known."""
         key = (op, kind, *[id(x) if type(x) is Value else _bits(x) for x in args])
         home = self._home(args)
         region: Region | None = self.region
@@ -152,6 +180,7 @@ class Builder:
         return found
 
     def _home(self, args: tuple) -> Region:
+        """Find the outermost region that knows all operands."""
         home, region = None, self.region
         for x in args:
             # An address may depend on a counter, and then belongs to its loop.
@@ -175,10 +204,13 @@ class Builder:
 
 def _simplify_product(builder: Builder, a: Any, b: Any) -> Any:
     for x, y in ((a, b), (b, a)):
-        if type(x) is not Value and x in (0, 1, -1):
-            zero = x.dtype.type(0)
+        if _is(x, 0):
             # Zero times anything is zero, infinity and NaN included.
-            return x * zero if x == 0 else y if x == 1 else builder.make("neg", y)
+            return x * x.dtype.type(0)
+        if _is(x, 1):
+            return y
+        if _is(x, -1):
+            return builder.make("neg", y)
     for x, y in ((a, b), (b, a)):
         # Signs go outwards, where a sum takes them up.
         if type(x) is Value and x.op == "neg":

@@ -1,16 +1,17 @@
-"""How a block of problems is solved: LLVM code around the functions that `cpu` writes.
+"""Lane compaction: LLVM code that runs the main loop of a program only on vectors most of whose lanes need it.
 
-Some problems take longer than the others of their block. A vector of which few lanes still do something is not worth a
-round: these lanes go to a second frame, where they wait for those of later blocks until it is full. Nothing else of a
-lane changes, so its result does not depend on its company.
+Some lanes take more rounds than the others of their block. A vector of which few lanes (a quarter) are unfinished is
+not worth a round: these lanes are moved to a second frame, the thread's spill frame (`%rest`), where they wait for
+lanes of later blocks until it is nearly full. Nothing else of a lane changes, so its result does not depend on the
+other lanes of its block.
 
-What a thread keeps beside its two frames, its book, in words: how many lanes wait, the rows that these are of, and from
-where to where lanes are being moved.
+Beside its two frames a thread has a work queue (`%book`), an array of words: how many lanes wait, their rows, and the
+sources and targets of the lanes that are being moved.
 """
 
-from jaxgrasp.kernels.cpu.vectors import VectorCode
+from jaxgrasp.kernels.cpu.vectors import Body
 
-# Bytes of two frames, which are on a thread's stack; where they would be more, nothing waits.
+# The most bytes of two frames, which are on a thread's stack; where they would be more, no lane waits.
 _MOST_FRAMES = 3 << 17
 
 _ALONE = """
@@ -29,7 +30,7 @@ define internal void @finish(ptr %state, ptr %rest, ptr %book) {
 _ROUNDS = """  %finished = call i64 @rounds(ptr %state, ptr %frame, i64 0)
   call void @after(ptr %state, ptr %frame)"""
 
-# A value of all lanes is a line of the cache: each is touched once.
+# Lanes are moved value by value, since a value of all lanes is a line of the cache: each is touched once.
 _MOVE = """
 define internal void @move.@TABLE@(ptr %a, ptr %b, ptr %sources, ptr %targets, i64 %lanes) {
 entry:
@@ -170,19 +171,19 @@ out:
 """
 
 
-def waits(code: VectorCode) -> bool:
-    """Whether there is a loop that some problems take longer for, and room for a second frame."""
-    return code.main is not None and 2 * code.used <= _MOST_FRAMES
+def compacts(body: Body) -> bool:
+    """Tell whether a program has a main loop, and the stack room for a second frame."""
+    return body.has_main_loop and 2 * body.frame_bytes <= _MOST_FRAMES
 
 
-def blocks(code: VectorCode) -> str:
-    """The functions `block` and `finish` of a program that is written."""
-    if not waits(code):
-        return _ALONE.replace("@ROUNDS@", _ROUNDS if code.main else "")
-    width, few = code.width, code.width // 4
+def write_block(body: Body) -> str:
+    """Write the function `block`, which runs the program on a block of lanes, and `finish`, for the lanes that wait."""
+    if not compacts(body):
+        return _ALONE.replace("@ROUNDS@", _ROUNDS if body.has_main_loop else "")
+    width, few = body.width, body.width // 4
     values = {
-        "@MOVES@": _moves(),
-        "@TABLES@": _tables(code),
+        "@MOVES@": _write_moves(),
+        "@TABLES@": _write_tables(body),
         "@FEW@": str(few),
         "@ALMOST@": str(width - few),
         "@SOURCES@": str(1 + width),
@@ -195,18 +196,18 @@ def blocks(code: VectorCode) -> str:
     return text
 
 
-def _moves() -> str:
-    """How a lane's data are copied to another one: numbers, integers and truth values."""
+def _write_moves() -> str:
+    """Write the functions that copy a lane's state to another lane: words, longs and flags, of 4, 8 and 1 bytes."""
     units = {"words": "i32", "longs": "i64", "flags": "i8"}
     return "".join(_MOVE.replace("@UNIT@", unit).replace("@TABLE@", name) for name, unit in units.items())
 
 
-def _tables(code: VectorCode) -> str:
-    """Where a lane's data lie in a frame: offsets of numbers, of integers and of truth values."""
-    sizes = {"f": code.dtype.itemsize, "i": 4, "b": 1}
+def _write_tables(body: Body) -> str:
+    """Write the offsets of a lane's state in a frame: of words, longs and flags."""
+    sizes = {"f": body.float_bytes, "i": 4, "b": 1}
     lines = []
     for name, size in (("words", 4), ("longs", 8), ("flags", 1)):
-        offsets = sorted(offset for offset, kind in code.live.items() if sizes[kind] == size)
+        offsets = sorted(offset for offset, kind in body.lane_state.items() if sizes[kind] == size)
         entries = ", ".join(f"i32 {offset}" for offset in offsets or [0])
         lines.append(f"@{name} = internal constant [{max(1, len(offsets))} x i32] [{entries}]")
         lines.append(f"@{name}.count = internal constant i64 {len(offsets)}")

@@ -1,8 +1,9 @@
-"""Sums of products as chains: each product but the first is then part of an addition, rounded once.
+"""Contraction of sums of products to chains of fused multiply-adds.
 
-Programs add in pairs, for XLA; but only one of the two products of a pair can be part of their sum. Along a chain the
-additions wait for each other, which costs nothing, since there are always others to do. Of terms that have a constant
-in common, it is taken out: processors add beside multiplying, and multiplications are what takes the time.
+Programs add in pairs, for XLA; but only one of the two products of a pair can be part of a fused multiply-add. In a
+chain ((a b + c d) + e f) + ... each product but the first can, and is rounded once with its sum. The additions of a
+chain wait for each other, which costs nothing, since there are always others to do. A constant factor that several
+terms have in common is factored out, since multiplications are what takes the time.
 """
 
 from collections import Counter
@@ -11,29 +12,31 @@ from typing import Any
 
 from jaxgrasp.kernels.program.expressions import Value
 
-# Longer sums are cut in two, for the rounding's sake as well.
+# Sums of more terms are cut in two, also for the sake of rounding.
 _LONGEST = 16
+# A scalar, and whether it is added rather than subtracted.
+Term = tuple[Any, bool]
 
 
 def chain_sums(values: Iterable[Value], count: Counter[Value]) -> list[Value]:
     """Turn sums into chains, in place.
 
     Args:
-        values: of a whole program.
-        count: how often each is used; stays right for all but sums.
+        values: all values of a program.
+        count: how often each value is used; it stays right for all but sums.
 
     Returns:
-        The sums that are left.
+        The sums that the program then has.
     """
     inner: set[Value] = set()
     sums = [value for value in values if _is_sum(value)]
     for value in sums:
         inner.update(x for x in value.args if type(x) is Value and _is_sum(x) and _belongs(x, value, count))
-    left: list[Value] = []
+    chained: list[Value] = []
     for value in sums:
         if value not in inner:
-            _chain(value, count, left)
-    return left
+            _chain(value, count, chained)
+    return chained
 
 
 def _is_sum(value: Value) -> bool:
@@ -41,14 +44,16 @@ def _is_sum(value: Value) -> bool:
 
 
 def _belongs(part: Value, whole: Value, count: Counter[Value]) -> bool:
-    """Nothing else needs the part, and it is computed where the whole is."""
+    """Tell whether nothing else needs the part, and it is computed in the region of the whole."""
     return count[part] == 1 and part.region is whole.region
 
 
-def _chain(root: Value, count: Counter[Value], left: list[Value]) -> None:
-    terms: list[tuple[Any, bool]] = []
+def _chain(root: Value, count: Counter[Value], chained: list[Value]) -> None:
+    """Make a sum and all sums within it one chain, where that saves something."""
+    # Collect the terms.
+    terms: list[Term] = []
     parts: list[Value] = []
-    stack: list[tuple[Any, bool]] = [(root, True)]
+    stack: list[Term] = [(root, True)]
     while stack:
         x, positive = stack.pop()
         if x is root or (type(x) is Value and _is_sum(x) and _belongs(x, root, count)):
@@ -57,31 +62,30 @@ def _chain(root: Value, count: Counter[Value], left: list[Value]) -> None:
             stack += [(second, positive == (x.op == "add")), (first, positive)]
         else:
             terms.append((x, positive))
+    # Factor constants out.
     count_before = len(terms)
-    terms = _constants_taken_out(terms, root, count, left)
+    terms = _factor_constants(terms, root, count, chained)
     if len(terms) == 1:
-        # Something positive was first, so that this is.
+        # The first term is never subtracted, so that this one is not.
         root.op, root.args = "mul", terms[0][0].args
         return
     products = [t for t in terms if type(t[0]) is Value and t[0].op == "mul" and _belongs(t[0], root, count)]
     if len(terms) == count_before and (len(terms) < 3 or len(products) < 2):
-        left += parts
+        chained += parts
         return
+    # Products go to the end: the first term is in no fused multiply-add.
     chosen = {id(x) for x, _ in products}
-    # Something positive comes first: there always is, as what is leftmost is not subtracted.
     ordered = _positive_first([t for t in terms if id(t[0]) not in chosen] + products)
-    root.op, root.args = _added(ordered, root, left)
-    left.append(root)
+    root.op, root.args = _last_addition(ordered, root, chained)
+    chained.append(root)
 
 
-def _constants_taken_out(
-    terms: list[tuple[Any, bool]], root: Value, count: Counter[Value], left: list[Value]
-) -> list[tuple[Any, bool]]:
-    """Terms, those with the same constant as one: it times their sum."""
+def _factor_constants(terms: list[Term], root: Value, count: Counter[Value], chained: list[Value]) -> list[Term]:
+    """Replace terms with the same constant factor by the product of the constant and their sum."""
     alike: dict[Any, list[tuple[Value, Any, bool]]] = {}
-    kept: list[tuple[Any, bool]] = []
+    kept: list[Term] = []
     for x, positive in terms:
-        constant, other = _constant_of(x, root, count)
+        constant, other = _split_constant(x, root, count)
         if constant is None:
             kept.append((x, positive))
         else:
@@ -97,15 +101,15 @@ def _constants_taken_out(
                 other = Value("mul", other, "f", root.region)
                 count[other] = 1
             parts.append((other, positive == sign))
-        total = _value(_positive_first(parts), root, left)
+        total = _add_in_turn(_positive_first(parts), root, chained)
         product = Value("mul", (constant, total), "f", root.region)
         count[product] = count[total] = 1
         kept.append((product, sign))
     return kept
 
 
-def _constant_of(x: Any, root: Value, count: Counter[Value]) -> tuple[Any, Any]:
-    """What a product has of a constant, and the rest: a value, or the factors of a new product."""
+def _split_constant(x: Any, root: Value, count: Counter[Value]) -> tuple[Any, Any]:
+    """Split a product into a constant and the rest: a value, or the factors of a new product. None if there is none."""
     if type(x) is not Value or x.op != "mul" or not _belongs(x, root, count):
         return None, None
     first, second = x.args
@@ -117,23 +121,28 @@ def _constant_of(x: Any, root: Value, count: Counter[Value]) -> tuple[Any, Any]:
     return None, None
 
 
-def _positive_first(terms: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
+def _positive_first(terms: list[Term]) -> list[Term]:
+    """Move a term that is added to the front; there always is one, since the leftmost term of a sum is added."""
     number = next(number for number, (_, positive) in enumerate(terms) if positive)
     return [terms[number], *terms[:number], *terms[number + 1 :]]
 
 
-def _added(terms: list[tuple[Any, bool]], like: Value, left: list[Value]) -> tuple[str, tuple]:
-    """The operation that ends the sum of all terms, the first of which is positive."""
+def _last_addition(terms: list[Term], like: Value, chained: list[Value]) -> tuple[str, tuple]:
+    """Return operation and operands of the last addition of a chain, whose first term is added."""
     half = len(terms) // 2
     if len(terms) > _LONGEST and any(positive for _, positive in terms[half:]):
-        return "add", (_value(terms[:half], like, left), _value(_positive_first(terms[half:]), like, left))
+        return "add", (
+            _add_in_turn(terms[:half], like, chained),
+            _add_in_turn(_positive_first(terms[half:]), like, chained),
+        )
     *before, (last, positive) = terms
-    return "add" if positive else "sub", (_value(before, like, left), last)
+    return "add" if positive else "sub", (_add_in_turn(before, like, chained), last)
 
 
-def _value(terms: list[tuple[Any, bool]], like: Value, left: list[Value]) -> Any:
+def _add_in_turn(terms: list[Term], like: Value, chained: list[Value]) -> Any:
+    """Return the sum of terms as a chain in the region of `like`."""
     if len(terms) == 1:
         return terms[0][0]
-    value = Value(*_added(terms, like, left), "f", like.region)
-    left.append(value)
+    value = Value(*_last_addition(terms, like, chained), "f", like.region)
+    chained.append(value)
     return value
