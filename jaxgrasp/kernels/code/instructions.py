@@ -25,7 +25,7 @@ class Instructions:
         estimates: whether the processor has AVX-512's estimates of reciprocals.
 
     types: LLVM's types of vectors of numbers "f", integers "i", truth values "b" and bytes, and of the integer "u".
-    kept: the same types in memory.
+    memory_types: the types that these have in memory.
     units: LLVM's types of single entries in memory.
     functions: signature and lines of every function.
     lines: of the function that is being written.
@@ -42,7 +42,7 @@ class Instructions:
         self.types = {"f": f"<{width} x {self.scalar}>", "i": f"<{width} x i32>", "b": f"<{width} x i1>", "u": "i64"}
         self.types["byte"] = f"<{width} x i8>"
         # In memory a truth value is a byte: of a vector of bits that fill no byte, LLVM takes the others for zero.
-        self.kept = {**self.types, "b": self.types["byte"]}
+        self.memory_types = {**self.types, "b": self.types["byte"]}
         self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
         self.functions: list[tuple[str, list[str]]] = []
         self.lines: list[str] = []
@@ -125,7 +125,7 @@ class Instructions:
         return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {index}")
 
     def repeat(self, count: int | str, body: Callable[[str], None]) -> None:
-        """Write a loop around what `body` writes, told the name of the round's number; it has at least one round."""
+        """Write a loop of at least one round; `body` writes a round, and is called with the name of its number."""
         before, inside, after = self.block, self.label("repeat"), self.label("after")
         self.do(f"br label %{inside}")
         self.enter(inside)

@@ -91,16 +91,16 @@ def _pack(code: VectorCode, source: str, lanes: list[str], count: int, kind: str
         starts.append(code.emit(f"getelementptr {unit}, ptr {source}, i64 {offset}"))
     if count >= width and kind != "b":
 
-        def some(entry: str) -> None:
+        def square(entry: str) -> None:
             rows = [code.emit(f"load {vector}, ptr {code.entry(start, unit, entry)}, align 4") for start in starts]
             for j, column in enumerate(_transpose(code, rows, vector)):
                 target = code.entry(code.entry(place, vector, entry), vector, j)
                 code.do(f"store {vector} {column}, ptr {target}, align 4")
 
-        _in_strides(code, count, some)
+        _repeat_squares(code, count, square)
         return place
     if 1 < count and kind != "b":
-        rows = [_first_entries(code, start, vector, count) for start in starts]
+        rows = [_load_first_entries(code, start, vector, count) for start in starts]
         for j, column in enumerate(_transpose(code, rows, vector)[:count]):
             code.do(f"store {vector} {column}, ptr {code.entry(place, vector, j)}, align 4")
         return place
@@ -113,7 +113,7 @@ def _pack(code: VectorCode, source: str, lanes: list[str], count: int, kind: str
             gathered = code.emit(f"insertelement {code.types[byte]} {gathered}, {unit} {scalar}, i64 {lane}")
         if kind == "b":
             gathered = code.emit(f"icmp ne {code.types['byte']} {gathered}, zeroinitializer")
-        code.store(kind, gathered, code.entry(place, code.kept[kind], entry))
+        code.store(kind, gathered, code.entry(place, code.memory_types[kind], entry))
 
     code.repeat(count, one)
     return place
@@ -127,7 +127,7 @@ def _unpack(code: VectorCode, result: Result, target: str, row: str) -> None:
     start = code.emit(f"getelementptr {unit}, ptr {target}, i64 {first}")
     if count >= width:
 
-        def some(entry: str) -> None:
+        def square(entry: str) -> None:
             columns = []
             for j in range(width):
                 source = code.entry(code.entry(place, vector, entry), vector, j)
@@ -136,7 +136,7 @@ def _unpack(code: VectorCode, result: Result, target: str, row: str) -> None:
                 target_row = code.entry(code.entry(start, unit, entry), unit, lane * count)
                 code.do(f"store {vector} {row}, ptr {target_row}, align 1")
 
-        _in_strides(code, count, some)
+        _repeat_squares(code, count, square)
         return
     columns = [code.emit(f"load {vector}, ptr {code.entry(place, vector, j)}, align 1") for j in range(count)]
     if count == 1:
@@ -150,19 +150,21 @@ def _unpack(code: VectorCode, result: Result, target: str, row: str) -> None:
             _store_first_entries(code, row, code.entry(start, unit, lane * count), vector, count)
 
 
-def _first_entries(code: VectorCode, source: str, vector: str, count: int) -> str:
+def _load_first_entries(code: VectorCode, source: str, vector: str, count: int) -> str:
     """Load the first entries of a vector, and nothing of what is behind them in memory."""
-    name, mask = _masked(code, "load", vector, f"ptr, i32, {code.types['b']}, {vector}", vector, count)
+    name, mask = _declare_masked(code, "load", vector, f"ptr, i32, {code.types['b']}, {vector}", vector, count)
     return code.emit(f"call {vector} {name}(ptr {source}, i32 1, {mask}, {vector} poison)")
 
 
 def _store_first_entries(code: VectorCode, row: str, target: str, vector: str, count: int) -> None:
     """Store the first entries of a vector."""
-    name, mask = _masked(code, "store", vector, f"{vector}, ptr, i32, {code.types['b']}", "void", count)
+    name, mask = _declare_masked(code, "store", vector, f"{vector}, ptr, i32, {code.types['b']}", "void", count)
     code.do(f"call void {name}({vector} {row}, ptr {target}, i32 1, {mask})")
 
 
-def _masked(code: VectorCode, what: str, vector: str, arguments: str, result: str, count: int) -> tuple[str, str]:
+def _declare_masked(
+    code: VectorCode, what: str, vector: str, arguments: str, result: str, count: int
+) -> tuple[str, str]:
     """Declare one of LLVM's functions for parts of vectors; return its name and the mask of the first entries."""
     unit = {"double": "f64", "float": "f32", "i32": "i32", "i8": "i8"}[vector.split(" x ")[1].rstrip(">")]
     name = f"@llvm.masked.{what}.v{code.width}{unit}.p0"
@@ -191,14 +193,14 @@ def _unpack_lanes(code: VectorCode, result: Result, target: str, row_of: Callabl
     code.repeat(valid, row)
 
 
-def _in_strides(code: VectorCode, count: int, some: Callable[[str], None]) -> None:
-    """Write a loop over `count` entries, a vector of them in each round; the last vector ends at the last entry."""
+def _repeat_squares(code: VectorCode, count: int, square: Callable[[str], None]) -> None:
+    """Write a loop over `count` entries, a square of them in each round; the last square ends at the last entry."""
     width = code.width
 
     def at(number: str) -> None:
         entry = code.emit(f"mul i64 {number}, {width}")
         late = code.emit(f"icmp ugt i64 {entry}, {count - width}")
-        some(code.emit(f"select i1 {late}, i64 {count - width}, i64 {entry}"))
+        square(code.emit(f"select i1 {late}, i64 {count - width}, i64 {entry}"))
 
     code.repeat(-(-count // width), at)
 

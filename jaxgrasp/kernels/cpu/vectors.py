@@ -56,9 +56,9 @@ class VectorCode(ValueCode):
     shared: names of pointers to the arguments that all lanes share, in the function that is being written.
     masks: for every loop of unknown length, the lanes whose condition holds in this round.
     counters: for every loop of known length, the name of its counter, the block before it, and the line of the phi.
-    carried: next values of carried scalars: their loops and numbers.
-    in_slots: values that were stored where the carried scalar lies whose next value they are.
-    conjunctions: names of masks and conditions.
+    carried: for every next value of a carried scalar, the loop and the number of the scalar.
+    in_slots: next values of carried scalars that were stored in the slots of these.
+    conjunctions: names of the masks that `conjoin` wrote.
     main_loop: the program's main loop, if it has one.
     lane_state: see `Body`.
     """
@@ -128,8 +128,13 @@ class VectorCode(ValueCode):
             else:
                 (self.enter_guard if event.what == "enter" else self.leave_guard)(event.subject, number)
             self.registers.advance(number)
-        state = self.lane_state
-        return Body(self.width, self.dtype.itemsize, self.frame_bytes, self.main_loop is not None, state)
+        return Body(
+            width=self.width,
+            float_bytes=self.dtype.itemsize,
+            frame_bytes=self.frame_bytes,
+            has_main_loop=self.main_loop is not None,
+            lane_state=self.lane_state,
+        )
 
     def compute(self, value: Value, number: int) -> None:
         """Compute a value; store the next value of a carried scalar in its slot if the old one is no longer needed."""
@@ -268,13 +273,13 @@ class VectorCode(ValueCode):
     def store(self, kind: str, name: str, place: str) -> None:
         """Store a vector."""
         if kind == "b":
-            name = self.emit(f"sext {self.types['b']} {name} to {self.kept['b']}")
-        self.do(f"store {self.kept[kind]} {name}, ptr {self.pointer(place)}, align {self.stride(kind)}")
+            name = self.emit(f"sext {self.types['b']} {name} to {self.memory_types['b']}")
+        self.do(f"store {self.memory_types[kind]} {name}, ptr {self.pointer(place)}, align {self.stride(kind)}")
 
     def load(self, kind: str, place: str) -> str:
         """Load a vector."""
-        name = self.emit(f"load {self.kept[kind]}, ptr {self.pointer(place)}, align {self.stride(kind)}")
-        return self.emit(f"icmp slt {self.kept['b']} {name}, zeroinitializer") if kind == "b" else name
+        name = self.emit(f"load {self.memory_types[kind]}, ptr {self.pointer(place)}, align {self.stride(kind)}")
+        return self.emit(f"icmp slt {self.memory_types['b']} {name}, zeroinitializer") if kind == "b" else name
 
     def store_where(self, mask: str | None, new: str, slot: str, kind: str) -> None:
         """Store a vector in the lanes where the mask holds; None for all lanes."""
@@ -302,7 +307,7 @@ class VectorCode(ValueCode):
 
     def load_own(self, kind: str, address: Address) -> str:
         """Load a scalar of an argument that every lane has for itself."""
-        return self.load(kind, self.place(address, self.kept[kind], self.own[address.buffer]))
+        return self.load(kind, self.place(address, self.memory_types[kind], self.own[address.buffer]))
 
     def load_shared(self, kind: str, address: Address) -> str:
         """Load a scalar of an argument that all lanes share, and copy it to all lanes."""

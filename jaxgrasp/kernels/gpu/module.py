@@ -112,10 +112,10 @@ def write_module(program: ScalarProgram, name: str) -> str:
     code, own = ThreadCode(program), []
     for number, ((shape, dtype), shared) in enumerate(zip(program.inputs, program.shared, strict=True)):
         base = f"%argument{number}"
-        own.append(base if shared else _row(code, base, math.prod(shape), kind_of(dtype)))
+        own.append(base if shared else _row_pointer(code, base, math.prod(shape), kind_of(dtype)))
     places, results = [], []
     for number, (out, (_, dtype)) in enumerate(zip(program.outputs, program.out_avals, strict=True)):
-        start = _row(code, f"%result{number}", out.size, kind_of(dtype))
+        start = _row_pointer(code, f"%result{number}", out.size, kind_of(dtype))
         places += [(start, entry, kind_of(dtype)) for entry in range(out.size)]
         results += list(out.flat)
 
@@ -139,7 +139,7 @@ def _unit(code: ThreadCode, kind: str) -> str:
     return "i8" if kind == "b" else code.types[kind]
 
 
-def _row(code: ThreadCode, base: str, count: int, kind: str) -> str:
+def _row_pointer(code: ThreadCode, base: str, count: int, kind: str) -> str:
     """Write the pointer to this thread's row."""
     before = code.emit(f"mul i64 %row, {count}")
     return code.emit(f"getelementptr {_unit(code, kind)}, ptr addrspace(1) {base}, i64 {before}")

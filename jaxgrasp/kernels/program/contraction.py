@@ -90,13 +90,13 @@ def _factor_constants(terms: list[Term], root: Value, count: Counter[Value], cha
             kept.append((x, positive))
         else:
             alike.setdefault(constant, []).append((x, other, positive))
-    for constant, some in alike.items():
-        if len(some) == 1:
-            kept.append((some[0][0], some[0][2]))
+    for constant, group in alike.items():
+        if len(group) == 1:
+            kept.append((group[0][0], group[0][2]))
             continue
-        sign = any(positive for *_, positive in some)
+        sign = any(positive for *_, positive in group)
         parts = []
-        for _, other, positive in some:
+        for _, other, positive in group:
             if isinstance(other, tuple):
                 other = Value("mul", other, "f", root.region)
                 count[other] = 1
