@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -201,6 +203,14 @@ def test_long_loops_read_what_all_problems_share():
         return lax.fori_loop(0, 32, body, jnp.zeros(1))
 
     assert_same(function, rows(30, 3), rows(128, 3, seed=1), shared=(False, True))
+
+
+def test_the_example_of_the_compilers_map(capsys):
+    """What the example in the README of kernels prints is what stands there."""
+    text = (Path(kernels.__file__).parent / "README.md").read_text()
+    code, *printed = re.findall(r"^```(?:python)?\n(.*?)^```", text.partition("## One example")[2], re.S | re.M)
+    exec(code, {})
+    assert capsys.readouterr().out.strip() == "".join(printed).strip()
 
 
 def test_what_cannot_be_fused_is_left_to_xla():

@@ -56,8 +56,8 @@ class Address(NamedTuple):
 
     buffer: number of the argument.
     offset: number of the entry in the flattened row, where there is no counter or it is zero.
-    counter: the counter of a loop that the entry depends on; None where the entry is always the same.
-    stride: entries from one round of the loop to the next.
+    counter: a loop's counter, or a value of type "u" computed from one; None where the entry is always the same.
+    stride: how many entries further one more of the counter is.
     """
 
     buffer: int
