@@ -219,3 +219,17 @@ def test_what_cannot_be_fused_is_left_to_xla():
 
     left = primitive.fused(transform, [rows(3, 4)], (False,), lambda leaves: leaves[0] * 2)
     np.testing.assert_array_equal(left, rows(3, 4) * 2)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [lambda w: w & 3, lambda w: 8 | w, lambda w: w ^ w[::-1], lambda w: ~w, jnp.abs, lambda w: lax.reduce_and(w, (0,))],
+)
+def test_bits_of_integers_are_left_to_xla(function):
+    """Kernels have these operations for truth values or for floats alone."""
+    whole = jnp.asarray(np.arange(12).reshape(6, 2) - 5, jnp.int32)
+    run = lambda w, x: (function(w), x)  # noqa: E731
+    leaves = [whole, rows(6, 1)]
+    by_xla = mapped(run, *leaves)
+    out = primitive.fused(lambda parts: run(*parts), leaves, (False, False), lambda leaves: mapped(run, *leaves))
+    np.testing.assert_array_equal(out[0], by_xla[0])

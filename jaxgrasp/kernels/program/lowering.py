@@ -18,6 +18,8 @@ from jaxgrasp.kernels.program.rules import ELEMENTWISE, RULES
 # Unroll limits, in rounds: of any loop, since the first round often starts from zeros and nobody reads all that the
 # last one leaves; of loops whose body reads the counter; of loops that stack results.
 _SHORT, _COUNTED, _STACKED = 2, 16, 64
+# The type of the operands of operations that have instructions for one type alone.
+_ONLY = {"div": "f", "abs": "f", "and": "b", "or": "b", "xor": "b", "not": "b"}
 # The most entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
 _MOST_ENTRIES = 400_000
 
@@ -168,8 +170,8 @@ class _Lowering:
 
     def elementwise(self, op: str, args: list[np.ndarray], aval: Any) -> np.ndarray:
         """Apply an operation entry by entry."""
-        if op == "div" and kind_of(aval.dtype) != "f":
-            raise Unsupported("division of integers")
+        if kind_of(aval.dtype) != _ONLY.get(op, kind_of(aval.dtype)):
+            raise Unsupported(f"the operation {op} on values of type {aval.dtype}")
         make, shape = self.builder.make, tuple(aval.shape)
         flat = [objects(np.broadcast_to(x, shape) if x.shape != shape else x).ravel() for x in args]
         out = array([make(op, *entries) for entries in zip(*flat, strict=True)], shape)

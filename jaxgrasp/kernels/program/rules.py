@@ -121,6 +121,8 @@ def _reduce(op: str) -> Callable:
         rows = objects(np.moveaxis(x, axes, range(len(axes)))).reshape(-1, math.prod(kept))
         if not rows.shape[0]:
             raise Unsupported("a reduction of nothing")
+        if op in ("and", "or") and kind_of(aval.dtype) != "b":
+            raise Unsupported("bits of integers")
         return fold_constants(array([lower.fold(op, list(rows[:, i])) for i in range(rows.shape[1])], kept), aval.dtype)
 
     return rule
