@@ -1,11 +1,11 @@
 """Lane compaction: LLVM code that runs the main loop of a program only on vectors most of whose lanes need it.
 
 Some lanes take more rounds than the others of their block. A vector of which few lanes (a quarter) are unfinished is
-not worth a round: these lanes are moved to a second frame, the thread's spill frame (`%rest`), where they wait for
+not worth a round: these lanes are moved to a second frame, the thread's spill frame (`%spill`), where they wait for
 lanes of later blocks until it is nearly full. Nothing else of a lane changes, so its result does not depend on the
 other lanes of its block.
 
-Beside its two frames a thread has a work queue (`%book`), an array of words: how many lanes wait, their rows, and the
+Beside its two frames a thread has a work queue (`%queue`), an array of words: how many lanes wait, their rows, and the
 sources and targets of the lanes that are being moved.
 """
 
@@ -15,14 +15,14 @@ from jaxgrasp.kernels.cpu.vectors import Body
 _MOST_FRAMES = 3 << 17
 
 _ALONE = """
-define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
+define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %spill, ptr %queue) {
   call void @before(ptr %state, i64 %number, ptr %frame)
 @ROUNDS@
   call void @unpack(ptr %state, i64 %number, ptr %frame)
   ret void
 }
 
-define internal void @finish(ptr %state, ptr %rest, ptr %book) {
+define internal void @finish(ptr %state, ptr %spill, ptr %queue) {
   ret void
 }
 """
@@ -71,10 +71,10 @@ out:
 _TOGETHER = """
 @TABLES@
 @MOVES@
-define internal void @move(ptr %a, ptr %b, ptr %book, i64 %lanes) {
+define internal void @move(ptr %a, ptr %b, ptr %queue, i64 %lanes) {
 entry:
-  %sources = getelementptr i64, ptr %book, i64 @SOURCES@
-  %targets = getelementptr i64, ptr %book, i64 @TARGETS@
+  %sources = getelementptr i64, ptr %queue, i64 @SOURCES@
+  %targets = getelementptr i64, ptr %queue, i64 @TARGETS@
   %none = icmp eq i64 %lanes, 0
   br i1 %none, label %out, label %some
 some:
@@ -88,16 +88,16 @@ out:
 
 declare i64 @llvm.cttz.i64(i64, i1)
 
-define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
+define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %spill, ptr %queue) {
 entry:
   call void @before(ptr %state, i64 %number, ptr %frame)
-  %unfinished = call i64 @rounds(ptr %state, ptr %frame, i64 @FEW@)
+  %unfinished = call i64 @rounds(ptr %state, ptr %frame, i64 @THRESHOLD@)
   %rows = load i64, ptr %state
   %first = mul i64 %number, @WIDTH@
-  %waiting = load i64, ptr %book
-  %book.rows = getelementptr i64, ptr %book, i64 1
-  %book.sources = getelementptr i64, ptr %book, i64 @SOURCES@
-  %book.targets = getelementptr i64, ptr %book, i64 @TARGETS@
+  %waiting = load i64, ptr %queue
+  %queue.rows = getelementptr i64, ptr %queue, i64 1
+  %queue.sources = getelementptr i64, ptr %queue, i64 @SOURCES@
+  %queue.targets = getelementptr i64, ptr %queue, i64 @TARGETS@
   br label %more
 more:
   %lanes = phi i64 [ %unfinished, %entry ], [ %others, %counted ]
@@ -110,9 +110,9 @@ one:
   %others = and i64 %lanes, %less
   %row = add i64 %first, %lane
   %target = add i64 %waiting, %moved
-  %row.p = getelementptr i64, ptr %book.rows, i64 %target
-  %source.p = getelementptr i64, ptr %book.sources, i64 %moved
-  %target.p = getelementptr i64, ptr %book.targets, i64 %moved
+  %row.p = getelementptr i64, ptr %queue.rows, i64 %target
+  %source.p = getelementptr i64, ptr %queue.sources, i64 %moved
+  %target.p = getelementptr i64, ptr %queue.targets, i64 %moved
   store i64 %row, ptr %row.p
   store i64 %lane, ptr %source.p
   store i64 %target, ptr %target.p
@@ -123,26 +123,26 @@ one:
 counted:
   br label %more
 listed:
-  call void @move(ptr %frame, ptr %rest, ptr %book, i64 %moved)
+  call void @move(ptr %frame, ptr %spill, ptr %queue, i64 %moved)
   %kept = add i64 %waiting, %moved
-  store i64 %kept, ptr %book
+  store i64 %kept, ptr %queue
   call void @after(ptr %state, ptr %frame)
   call void @unpack(ptr %state, i64 %number, ptr %frame)
   %full = icmp ugt i64 %kept, @ALMOST@
   br i1 %full, label %complete, label %out
 complete:
-  call void @finish(ptr %state, ptr %rest, ptr %book)
+  call void @finish(ptr %state, ptr %spill, ptr %queue)
   br label %out
 out:
   ret void
 }
 
-define internal void @finish(ptr %state, ptr %rest, ptr %book) {
+define internal void @finish(ptr %state, ptr %spill, ptr %queue) {
 entry:
-  %book.rows = getelementptr i64, ptr %book, i64 1
-  %book.sources = getelementptr i64, ptr %book, i64 @SOURCES@
-  %book.targets = getelementptr i64, ptr %book, i64 @TARGETS@
-  %count = load i64, ptr %book
+  %queue.rows = getelementptr i64, ptr %queue, i64 1
+  %queue.sources = getelementptr i64, ptr %queue, i64 @SOURCES@
+  %queue.targets = getelementptr i64, ptr %queue, i64 @TARGETS@
+  %count = load i64, ptr %queue
   %none = icmp eq i64 %count, 0
   br i1 %none, label %out, label %fill
 fill:
@@ -151,19 +151,19 @@ fill:
   %more = icmp ult i64 %lane, @WIDTH@
   br i1 %more, label %copy, label %run
 copy:
-  %source.p = getelementptr i64, ptr %book.sources, i64 %empty
-  %target.p = getelementptr i64, ptr %book.targets, i64 %empty
+  %source.p = getelementptr i64, ptr %queue.sources, i64 %empty
+  %target.p = getelementptr i64, ptr %queue.targets, i64 %empty
   store i64 0, ptr %source.p
   store i64 %lane, ptr %target.p
   %lane.next = add i64 %lane, 1
   %empty.next = add i64 %empty, 1
   br label %fill
 run:
-  call void @move(ptr %rest, ptr %rest, ptr %book, i64 %empty)
-  %unfinished = call i64 @rounds(ptr %state, ptr %rest, i64 0)
-  call void @after(ptr %state, ptr %rest)
-  call void @unpack_rows(ptr %state, ptr %book.rows, i64 %count, ptr %rest)
-  store i64 0, ptr %book
+  call void @move(ptr %spill, ptr %spill, ptr %queue, i64 %empty)
+  %unfinished = call i64 @rounds(ptr %state, ptr %spill, i64 0)
+  call void @after(ptr %state, ptr %spill)
+  call void @unpack_rows(ptr %state, ptr %queue.rows, i64 %count, ptr %spill)
+  store i64 0, ptr %queue
   br label %out
 out:
   ret void
@@ -180,12 +180,12 @@ def write_block(body: Body) -> str:
     """Write the function `block`, which runs the program on a block of lanes, and `finish`, for the lanes that wait."""
     if not compacts(body):
         return _ALONE.replace("@ROUNDS@", _ROUNDS if body.has_main_loop else "")
-    width, few = body.width, body.width // 4
+    width, threshold = body.width, body.width // 4
     values = {
         "@MOVES@": _write_moves(),
         "@TABLES@": _write_tables(body),
-        "@FEW@": str(few),
-        "@ALMOST@": str(width - few),
+        "@THRESHOLD@": str(threshold),
+        "@ALMOST@": str(width - threshold),
         "@SOURCES@": str(1 + width),
         "@TARGETS@": str(1 + 2 * width),
         "@WIDTH@": str(width),

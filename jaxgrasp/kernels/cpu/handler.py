@@ -29,9 +29,9 @@ declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)
 define internal void @take(ptr %state) {
 entry:
   %frame = alloca [@FRAME_BYTES@ x i8], align 64
-  %rest = alloca [@REST_BYTES@ x i8], align 64
-  %book = alloca [@BOOK@ x i64]
-  store i64 0, ptr %book
+  %spill = alloca [@SPILL_BYTES@ x i8], align 64
+  %queue = alloca [@QUEUE_WORDS@ x i64]
+  store i64 0, ptr %queue
   %blocks.p = getelementptr i64, ptr %state, i64 1
   %next.p = getelementptr i64, ptr %state, i64 2
   %done.p = getelementptr i64, ptr %state, i64 3
@@ -52,7 +52,7 @@ work:
 one:
   %number = phi i64 [ %from, %work ], [ %following, %one ]
 @SPOIL@
-  call void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book)
+  call void @block(ptr %state, i64 %number, ptr %frame, ptr %spill, ptr %queue)
   %following = add i64 %number, 1
   %again = icmp ult i64 %following, %to
   br i1 %again, label %one, label %counted
@@ -61,7 +61,7 @@ counted:
   %taken = add i64 %before, %share
   br label %more
 out:
-  call void @finish(ptr %state, ptr %rest, ptr %book)
+  call void @finish(ptr %state, ptr %spill, ptr %queue)
   %done = atomicrmw add ptr %done.p, i64 %before release
   ret void
 }
@@ -140,8 +140,8 @@ share:
   %capped = select i1 %large, i64 @CHUNK@, i64 %even
   %none = icmp eq i64 %capped, 0
   %chunk = select i1 %none, i64 1, i64 %capped
-  %few = icmp ult i64 %blocks, %workers
-  %used = select i1 %few, i64 %blocks, i64 %workers
+  %fewer = icmp ult i64 %blocks, %workers
+  %used = select i1 %fewer, i64 %blocks, i64 %workers
   store i64 %rows, ptr %state
   %s1 = getelementptr i64, ptr %state, i64 1
   %s2 = getelementptr i64, ptr %state, i64 2
@@ -198,8 +198,8 @@ attributes #0 = { nounwind }
 """
 
 # Before each block, for tests: no bit of its frame is what it was, nor of the second one where no lane waits there.
-SPOIL = """  %waiting = load i64, ptr %book
+SPOIL = """  %waiting = load i64, ptr %queue
   %nobody = icmp eq i64 %waiting, 0
-  %unused = select i1 %nobody, i64 @REST_BYTES@, i64 0
+  %unused = select i1 %nobody, i64 @SPILL_BYTES@, i64 0
   call void @llvm.memset.p0.i64(ptr %frame, i8 -1, i64 @FRAME_BYTES@, i1 false)
-  call void @llvm.memset.p0.i64(ptr %rest, i8 -1, i64 %unused, i1 false)"""
+  call void @llvm.memset.p0.i64(ptr %spill, i8 -1, i64 %unused, i1 false)"""

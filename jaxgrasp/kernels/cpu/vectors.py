@@ -121,7 +121,7 @@ class VectorCode(ValueCode):
                 store(event.subject, self.registers.fetch(event.uses[0]) if event.uses else "")
             elif event.what == "test":
                 self.masks[event.subject] = self.operand(event.subject.condition, "b")
-                least = "%few" if event.subject is self.main_loop else "0"
+                least = "%threshold" if event.subject is self.main_loop else "0"
                 self.branch_if_more(self.masks[event.subject], event.subject, least)
             elif isinstance(event.subject, Loop):
                 (self.enter_loop if event.what == "enter" else self.leave_loop)(event.subject, number)
@@ -175,7 +175,7 @@ class VectorCode(ValueCode):
         if loop is self.main_loop:
             self.lane_state = self.collect_lane_state(number)
             self.do("ret void")
-            self.begin("i64 @rounds(ptr noalias %state, ptr noalias %frame, i64 %few)")
+            self.begin("i64 @rounds(ptr noalias %state, ptr noalias %frame, i64 %threshold)")
         before, head = self.block, self.label("head")
         self.labels[loop] = (head, self.label("body"), self.label("after"))
         self.do(f"br label %{head}")

@@ -13,7 +13,7 @@ _API_BYTES = ffi.Api.STREAM_GET + 8
 
 _HANDLER = """
 declare i32 @snprintf(ptr, i64, ptr, ...)
-@said = private constant [@LENGTH@ x i8] c"@SAID@"
+@format = private constant [@LENGTH@ x i8] c"@FORMAT@"
 @PREAMBLE@
   %context = call ptr @field(ptr %frame, i64 @CallFrame.CONTEXT@)
   %arguments = call ptr @field(ptr %frame, i64 @CallFrame.ARGUMENTS@)
@@ -82,7 +82,7 @@ go:
   br i1 %good, label %nothing, label %failed
 failed:
   %message = alloca [128 x i8]
-  %length = call i32 (ptr, i64, ptr, ...) @snprintf(ptr %message, i64 128, ptr @said, i32 %code)
+  %length = call i32 (ptr, i64, ptr, ...) @snprintf(ptr %message, i64 128, ptr @format, i32 %code)
   %report = alloca [4 x i64]
   store i64 @CallBytes.ERROR_CREATE@, ptr %report
   %report.1 = getelementptr i64, ptr %report, i64 1
@@ -97,7 +97,7 @@ failed:
 }
 """  # noqa: E501
 
-_SAID = "jaxgrasp: the GPU's driver does not launch a kernel, CUDA error %d"
+_FORMAT = "jaxgrasp: the GPU's driver does not launch a kernel, CUDA error %d"
 
 
 def write_module(name: str, *, kernel: int, launch: int, threads: int) -> str:
@@ -116,7 +116,7 @@ def write_module(name: str, *, kernel: int, launch: int, threads: int) -> str:
         "THREADS": threads,
         "LAUNCH": launch,
         "KERNEL": kernel,
-        "SAID": _SAID + "\\00",
-        "LENGTH": len(_SAID) + 1,
+        "FORMAT": _FORMAT + "\\00",
+        "LENGTH": len(_FORMAT) + 1,
     }
     return ffi.fill(_HANDLER, values)
