@@ -213,6 +213,18 @@ def test_the_example_of_the_compilers_map(capsys):
     assert capsys.readouterr().out.strip() == "".join(printed).strip()
 
 
+def test_loops_add_their_counter_to_integers_of_every_lane():
+    def function(x, whole):
+        def body(i, state):
+            total, mixed, last = state
+            return total + x * i, mixed + i * whole, jnp.where(x[0] > 0, i, i + 1) + last
+
+        return lax.fori_loop(0, 40, body, (jnp.zeros_like(x), whole, whole[0]))
+
+    whole = jnp.asarray(np.arange(40).reshape(20, 2) - 7, jnp.int32)
+    assert_same(function, rows(20, 4), whole)
+
+
 def test_what_cannot_be_fused_is_left_to_xla():
     def transform(parts):
         return jnp.fft.fft(parts[0][:, 0]).real[:, None]

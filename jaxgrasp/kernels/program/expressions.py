@@ -161,9 +161,11 @@ class Builder:
                 return np.bool_(False)
             kind = "b"
         elif op == "select":
-            kind = next(_kind(x) for x in args[1:])
+            # The condition differs between lanes, and so does what it picks of integers that do not.
+            kind = _kind(args[1]).replace("u", "i")
         else:
-            kind = next(_kind(x) for x in args if type(x) is Value)
+            kinds = [x.kind for x in args if type(x) is Value]
+            kind = "i" if "i" in kinds else kinds[0]
         return self.value(op, args, kind)
 
     def value(self, op: str, args: tuple, kind: str) -> Value:
