@@ -1,4 +1,4 @@
-"""What the compiler asks of a kind of devices: the code for them, and the function by which XLA calls it."""
+"""The Protocol of targets: compile a program for a kind of devices, and load the function by which XLA calls it."""
 
 from typing import Protocol
 

@@ -13,7 +13,7 @@ from jaxgrasp.kernels.program.schedule import Schedule, in_memory
 
 
 class Body(NamedTuple):
-    """What the functions around a program's code have to know of it.
+    """A description of a program's code for the functions around it.
 
     width: lanes of a vector.
     float_bytes: size of a number.
@@ -192,10 +192,8 @@ class VectorCode(ValueCode):
         moved = []
         for index, (value, kind) in enumerate(zip(loop.outputs, loop.kinds, strict=True)):
             slot = self.slots[loop][index]
-            if (
-                not (value in self.in_slots and self.registers.places[value] == slot)
-                and value is not loop.carries[index]
-            ):
+            is_there = value in self.in_slots and self.registers.places[value] == slot
+            if not is_there and value is not loop.carries[index]:
                 moved.append((self.operand(value, kind), slot, kind))
         for name, slot, kind in moved:
             self.store_where(self.masks.get(loop), name, slot, kind)

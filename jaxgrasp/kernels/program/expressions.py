@@ -52,7 +52,7 @@ class Region:
 
 
 class Address(NamedTuple):
-    """Where a scalar of an argument lies: entry `offset + counter * stride` of a row of the argument.
+    """The place of a scalar of an argument: entry `offset + counter * stride` of a row of the argument.
 
     buffer: number of the argument.
     offset: number of the entry in the flattened row, where there is no counter or it is zero.
@@ -88,7 +88,7 @@ class Value:
 
     @property
     def address(self) -> Address:
-        """Where the scalar lies; only "own" and "shared" have an address."""
+        """The place of the scalar; only "own" and "shared" have an address."""
         return self.args[0]
 
 
@@ -206,12 +206,15 @@ class Builder:
 
 def _simplify_product(builder: Builder, a: Any, b: Any) -> Any:
     for x, y in ((a, b), (b, a)):
-        if _is(x, 0):
+        if type(x) is Value:
+            continue
+        constant: np.generic = x
+        if constant == 0:
             # Zero times anything is zero, infinity and NaN included.
-            return x * x.dtype.type(0)
-        if _is(x, 1):
+            return x * constant.dtype.type(0)
+        if constant == 1:
             return y
-        if _is(x, -1):
+        if constant == -1:
             return builder.make("neg", y)
     for x, y in ((a, b), (b, a)):
         # Signs go outwards, where a sum takes them up.
@@ -315,12 +318,12 @@ _SIMPLIFY: dict[str, Callable[..., Any]] = {
 
 
 def _is(x: Any, number: int) -> bool:
-    """Whether a scalar is this constant."""
+    """Tell whether a scalar is this constant."""
     return type(x) is not Value and bool(x == number)
 
 
 def _does(x: Any, op: str) -> bool:
-    """Whether a scalar is computed by this operation."""
+    """Tell whether a scalar is computed by this operation."""
     return type(x) is Value and x.op == op
 
 
