@@ -145,7 +145,7 @@ def inspected(shapes: tuple[tuple[int, int], ...]) -> list[str]:
         for dtype in DTYPES:
             code = kernel(contacts_count, edges, dtype)
             for capability in CAPABILITIES:
-                text = gpu.ptx(code, capability)
+                text = gpu.write_ptx(code, capability)
                 made = assembled(text, capability)
                 lines.append(
                     f"| {contacts_count} | {edges} | {dtype} | sm_{capability} | {len(text.splitlines()):,} | "
@@ -164,7 +164,7 @@ def kernel(contacts_count: int, edges: int, dtype: str) -> str:
         forces = jg.DisturbanceSet.forces(1.0)
         jax.jit(lambda: jg.largest_disturbance(contacts, forces, cone_edges=edges)).lower()
     ((jaxpr, shared),) = seen
-    return gpu.module(lowering.lowered(jaxpr, list(shared)), "margin")
+    return gpu.write_module(lowering.lower(jaxpr, list(shared)), "margin")
 
 
 def assembler() -> str | None:

@@ -29,7 +29,7 @@ from benchmarks.suite import floor, ours, problems
 from benchmarks.suite.clock import by_turns, say, warn_if_busy
 from jaxgrasp import kernels
 from jaxgrasp.kernels import primitive
-from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.code import llvm
 from jaxgrasp.kernels.cpu import module as cpu
 from jaxgrasp.kernels.program import lowering, schedule
 from jaxgrasp.kernels.store import folder
@@ -65,7 +65,7 @@ def main() -> None:
     lines = [
         "# Fused kernels",
         "",
-        f"`python -m benchmarks.kernels`, {os.cpu_count()} cores, {machine.machine().description.split(',')[0]}, "
+        f"`python -m benchmarks.kernels`, {os.cpu_count()} cores, {llvm.processor().description.split(',')[0]}, "
         f"load average at the start {load:.1f}.",
         "",
         *first_answers(),
@@ -109,22 +109,22 @@ def on_xla(function, *args):
 def watched() -> Iterator[list]:
     """The programs that become kernels inside."""
     seen: list = []
-    target = primitive.target
+    register = primitive.register
 
     def watching(plan):
         seen.append((plan.trace(), plan.shared))
-        return target(plan)
+        return register(plan)
 
-    primitive.target = watching
+    primitive.register = watching
     try:
         yield seen
     finally:
-        primitive.target = target
+        primitive.register = register
 
 
 def flops(jaxpr, shared, iterations: float) -> float:
     """Operations on numbers for one problem."""
-    order = schedule.scheduled(lowering.lowered(jaxpr, list(shared)))
+    order = schedule.schedule(lowering.lower(jaxpr, list(shared)))
     total, inside = 0.0, []
     for event in order.events:
         if event.what == "enter":
@@ -300,13 +300,13 @@ def around() -> list[str]:
 def compile_seconds(jaxpr, shared) -> tuple[float, float]:
     """From a jaxpr to object code, and from what is kept on disk to a function."""
     start = time.perf_counter()
-    program, at = lowering.lowered(jaxpr, list(shared)), machine.machine()
+    program, at = lowering.lower(jaxpr, list(shared)), llvm.processor()
     width = at.vector_bytes // program.builder.dtype.itemsize
-    objects = machine.compiled(cpu.module(program, "timed", width, estimates=at.estimates))
+    objects = llvm.compile_module(cpu.write_module(program, "timed", width, estimates=at.estimates))
     cold = time.perf_counter() - start
     folder.keep("timed", objects)
     start = time.perf_counter()
-    machine.loaded(folder.cached("timed"), "timed")
+    llvm.load(folder.read("timed"), "timed")
     return cold, time.perf_counter() - start
 
 

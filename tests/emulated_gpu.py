@@ -15,9 +15,8 @@ import jax
 import pytest
 
 from jaxgrasp.kernels import primitive
-from jaxgrasp.kernels.code import llvm as machine
-from jaxgrasp.kernels.gpu import driver as cuda
-from jaxgrasp.kernels.gpu import handler as launcher
+from jaxgrasp.kernels.code import llvm
+from jaxgrasp.kernels.gpu import driver, handler
 from jaxgrasp.kernels.gpu import module as gpu
 from jaxgrasp.lanes import tiles as lanes
 
@@ -90,13 +89,13 @@ def kernel(code: bytes, name: str, devices: list[int]) -> int:
         for index, special in enumerate(REGISTERS)
     )
     grid = GRID.replace("@READ@", read).replace("@CALL@", "\n".join(call))
-    return machine.loaded(machine.compiled("\n".join(lines).replace(SPECIAL, "@special.") + grid), "grid")
+    return llvm.load(llvm.compile_module("\n".join(lines).replace(SPECIAL, "@special.") + grid), "grid")
 
 
 @cache
 def launch_address() -> int:
     """In place of the driver's."""
-    return machine.loaded(machine.compiled(LAUNCH), "launch")
+    return llvm.load(llvm.compile_module(LAUNCH), "launch")
 
 
 def no_kernel(leaves):
@@ -118,14 +117,14 @@ def in_place(folder: Path) -> Iterator[None]:
         wanted = platform == "cuda" and primitive._allowed.value
         return primitive.fused(function, leaves, shared, no_kernel if wanted else otherwise, known_as, platform)
 
-    def module(program, name, write=gpu.module):
+    def module(program, name, write=gpu.write_module):
         codes.append(write(program, name))
         return codes[-1]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
         patch.setenv(primitive.SETTING, "fused")
-        patch.setattr(gpu, "module", module)
+        patch.setattr(gpu, "write_module", module)
         patch.setattr(lanes, "fused", fused)
         if not there:
             emulate(patch)
@@ -142,11 +141,11 @@ def emulate(patch: pytest.MonkeyPatch) -> None:
     asks = "call ptr %stream.f(ptr %question)"
     patch.setattr(gpu, "PLATFORM", "cpu")
     patch.setattr(gpu, "devices", lambda: gpu.Devices([0], 80, "emulated"))
-    patch.setattr(gpu, "ptx", lambda code, capability: code)
-    patch.setattr(cuda, "kernel", kernel)
-    patch.setattr(cuda, "launch_address", launch_address)
-    assert asks in launcher._HANDLER
-    patch.setattr(launcher, "_HANDLER", launcher._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
+    patch.setattr(gpu, "write_ptx", lambda code, capability: code)
+    patch.setattr(driver, "load_kernel", kernel)
+    patch.setattr(driver, "launch_address", launch_address)
+    assert asks in handler._HANDLER
+    patch.setattr(handler, "_HANDLER", handler._HANDLER.replace(asks, "getelementptr i8, ptr null, i64 0"))
     patch.setattr(primitive, "usable", lambda platform: primitive._allowed.value and primitive._works(platform))
 
 

@@ -82,7 +82,7 @@ def writers(rows: int) -> dict[str, tuple[str, Callable[[Path], None], Callable[
         from jaxgrasp.kernels.store import folder
 
         os.environ["XDG_CACHE_HOME"] = str(path.parents[2])
-        return folder.cached(path.name) == bytes(40_000_000)
+        return folder.read(path.name) == bytes(40_000_000)
 
     def picture(path: Path) -> None:
         write_figure(figure_of_ranking(table), path)

@@ -1,4 +1,7 @@
-"""Fused kernels: one jaxpr, as vector code with one problem per SIMD lane, or a GPU's with one per thread."""
+"""Fused kernels: one jaxpr as native code, with one lane of the batch per SIMD lane of a CPU or per thread of a GPU.
+
+README.md in this folder is the map of the compiler.
+"""
 
 from jaxgrasp.kernels.primitive import allowed, distrust, fused, usable, without
 

@@ -201,7 +201,7 @@ def test_the_same_gradients(emulated):
 
 @cache
 def ptx(dtype: str, capability: int) -> str:
-    return gpu.ptx(margins(dtype)[2], capability)
+    return gpu.write_ptx(margins(dtype)[2], capability)
 
 
 @pytest.mark.parametrize("capability", CAPABILITIES)
@@ -229,13 +229,13 @@ def test_ptx_assembles(dtype, capability):
 
 def program_of(function, *shapes, dtype="float64"):
     given = [jax.ShapeDtypeStruct((*shape, 1), dtype) for shape in shapes]
-    return lowering.lowered(jax.make_jaxpr(function)(*given), [False] * len(given))
+    return lowering.lower(jax.make_jaxpr(function)(*given), [False] * len(given))
 
 
 @pytest.mark.parametrize("function", [jnp.exp, jnp.log])
 def test_functions_that_gpus_have_no_instructions_for_are_left_to_xla(function):
     with pytest.raises(Unsupported, match="on a GPU"):
-        gpu.module(program_of(function, (3,)), "kernel")
+        gpu.write_module(program_of(function, (3,)), "kernel")
 
 
 def test_operations_without_results_are_left_to_xla():

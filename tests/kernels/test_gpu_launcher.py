@@ -12,9 +12,8 @@ import pytest
 
 from jaxgrasp import kernels
 from jaxgrasp.kernels import primitive
-from jaxgrasp.kernels.code import llvm as machine
-from jaxgrasp.kernels.gpu import driver as cuda
-from jaxgrasp.kernels.gpu import handler as launcher
+from jaxgrasp.kernels.code import llvm
+from jaxgrasp.kernels.gpu import driver, handler
 from jaxgrasp.kernels.gpu import module as gpu
 from jaxgrasp.lanes import tiles as lanes
 
@@ -54,8 +53,8 @@ class Driver:
             ctypes.CFUNCTYPE(p, p)(error_create),
         ]
         launch_at, stream_at, error_at = (ctypes.cast(f, p).value for f in self.functions)
-        text = launcher.module("launcher", kernel=4321, launch=launch_at, threads=64)
-        self.handler = ctypes.CFUNCTYPE(p, p)(machine.loaded(machine.compiled(text), "launcher"))
+        text = handler.write_module("launcher", kernel=4321, launch=launch_at, threads=64)
+        self.handler = ctypes.CFUNCTYPE(p, p)(llvm.load(llvm.compile_module(text), "launcher"))
         version = emulated_gpu.Version(ctypes.sizeof(emulated_gpu.Version), None, 0, 3)
         size = ctypes.sizeof(emulated_gpu.Api)
         self.api = emulated_gpu.Api(size, None, version, None, error_at, None, None, None, stream_at)
@@ -109,9 +108,9 @@ def test_structures_that_do_not_fit_launch_nothing():
 @no_gpu
 def test_xla_hears_of_errors():
     """XLA's own structures: on a CPU it has no stream to give."""
-    text = launcher.module("without_stream", kernel=1, launch=1, threads=64)
-    address = machine.loaded(machine.compiled(text), "without_stream")
-    jax.ffi.register_ffi_target("without_stream", machine.capsule(address), platform="cpu")
+    text = handler.write_module("without_stream", kernel=1, launch=1, threads=64)
+    address = llvm.load(llvm.compile_module(text), "without_stream")
+    jax.ffi.register_ffi_target("without_stream", llvm.capsule(address), platform="cpu")
     with pytest.raises(jax.errors.JaxRuntimeError, match="GPU context is not available"):
         jax.block_until_ready(jax.ffi.ffi_call("without_stream", jax.ShapeDtypeStruct((3,), "float32"))(jnp.zeros(3)))
 
@@ -152,16 +151,16 @@ def load(monkeypatch):
                 raise OSError("cannot open shared object file")
             return library
 
-        monkeypatch.setattr(cuda.ctypes, "CDLL", cdll)
+        monkeypatch.setattr(driver.ctypes, "CDLL", cdll)
 
-    cuda.driver.cache_clear()
+    driver.load_driver.cache_clear()
     yield put
-    cuda.driver.cache_clear()
+    driver.load_driver.cache_clear()
 
 
 def test_a_kernel_is_loaded_and_assembled_for_every_device(load):
     load(library := Library())
-    assert cuda.kernel(b"ptx", "kernel", [0, 1]) == 22
+    assert driver.load_kernel(b"ptx", "kernel", [0, 1]) == 22
     ready = ["cuDeviceGet", "cuKernelGetAttribute"]
     assert library.calls[2:] == ["cuLibraryLoadData", "cuLibraryGetKernel", *ready, *ready]
 
@@ -177,7 +176,7 @@ def test_a_kernel_is_loaded_and_assembled_for_every_device(load):
 def test_a_kernel_that_does_not_load_says_why(load, wrong, why):
     load(Library(wrong=wrong))
     with pytest.raises(RuntimeError) as raised:
-        cuda.kernel(b"ptx", "kernel", [0])
+        driver.load_kernel(b"ptx", "kernel", [0])
     assert str(raised.value).endswith(why)
 
 
@@ -191,8 +190,8 @@ def test_a_kernel_that_does_not_load_says_why(load, wrong, why):
 )
 def test_a_driver_that_cannot_be_used_says_why(load, library, why):
     load(library)
-    with pytest.raises(machine.Unavailable, match=why):
-        cuda.driver()
+    with pytest.raises(llvm.Unavailable, match=why):
+        driver.load_driver()
 
 
 # What is chosen
@@ -207,7 +206,7 @@ def test_without_a_gpu_nothing_is_looked_for(monkeypatch):
     def look():
         raise AssertionError("it is looked for a GPU")
 
-    monkeypatch.setattr(cuda, "driver", look)
+    monkeypatch.setattr(driver, "load_driver", look)
     monkeypatch.setattr(gpu, "devices", look)
     for asked in ("auto", "xla", "fused"):
         monkeypatch.setenv(primitive.SETTING, asked)
@@ -221,7 +220,7 @@ def test_where_a_gpu_cannot_be_used_one_warning_says_why(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not kernels.usable("cuda")
     monkeypatch.setenv(primitive.SETTING, "fused")
-    primitive._tell.cache_clear()
+    primitive._warn.cache_clear()
     with pytest.warns(RuntimeWarning, match="JAX knows no GPU of NVIDIA's") as told:
         assert not kernels.usable("cuda")
         assert not kernels.usable("cuda")
@@ -235,8 +234,8 @@ def test_a_kernel_that_does_not_load_is_left_to_xla(monkeypatch, tmp_path):
         raise RuntimeError("the GPU's driver does not load it")
 
     with emulated_gpu.in_place(tmp_path):
-        monkeypatch.setattr(cuda, "kernel", wrong)
-        primitive._tell.cache_clear()
+        monkeypatch.setattr(driver, "load_kernel", wrong)
+        primitive._warn.cache_clear()
         with pytest.warns(RuntimeWarning, match="does not load it"):
             out = primitive.fused(doubled, [jnp.ones((3, 5))], (False,), lambda leaves: leaves[0] - 7, None, "cuda")
         np.testing.assert_array_equal(out, np.full((3, 5), -6))

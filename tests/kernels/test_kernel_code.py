@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -203,9 +205,43 @@ def test_long_loops_read_what_all_problems_share():
     assert_same(function, rows(30, 3), rows(128, 3, seed=1), shared=(False, True))
 
 
+def test_the_example_of_the_compilers_map(capsys):
+    """What the example in the README of kernels prints is what stands there."""
+    text = (Path(kernels.__file__).parent / "README.md").read_text()
+    code, *printed = re.findall(r"^```(?:python)?\n(.*?)^```", text.partition("## One example")[2], re.S | re.M)
+    exec(code, {})
+    assert capsys.readouterr().out.strip() == "".join(printed).strip()
+
+
+def test_loops_add_their_counter_to_integers_of_every_lane():
+    def function(x, whole):
+        def body(i, state):
+            total, mixed, last = state
+            return total + x * i, mixed + i * whole, jnp.where(x[0] > 0, i, i + 1) + last
+
+        return lax.fori_loop(0, 40, body, (jnp.zeros_like(x), whole, whole[0]))
+
+    whole = jnp.asarray(np.arange(40).reshape(20, 2) - 7, jnp.int32)
+    assert_same(function, rows(20, 4), whole)
+
+
 def test_what_cannot_be_fused_is_left_to_xla():
     def transform(parts):
         return jnp.fft.fft(parts[0][:, 0]).real[:, None]
 
     left = primitive.fused(transform, [rows(3, 4)], (False,), lambda leaves: leaves[0] * 2)
     np.testing.assert_array_equal(left, rows(3, 4) * 2)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [lambda w: w & 3, lambda w: 8 | w, lambda w: w ^ w[::-1], lambda w: ~w, jnp.abs, lambda w: lax.reduce_and(w, (0,))],
+)
+def test_bits_of_integers_are_left_to_xla(function):
+    """Kernels have these operations for truth values or for floats alone."""
+    whole = jnp.asarray(np.arange(12).reshape(6, 2) - 5, jnp.int32)
+    run = lambda w, x: (function(w), x)  # noqa: E731
+    leaves = [whole, rows(6, 1)]
+    by_xla = mapped(run, *leaves)
+    out = primitive.fused(lambda parts: run(*parts), leaves, (False, False), lambda leaves: mapped(run, *leaves))
+    np.testing.assert_array_equal(out[0], by_xla[0])

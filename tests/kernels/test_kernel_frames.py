@@ -9,16 +9,16 @@ import frame_reads
 import jax
 import jax.numpy as jnp
 import kernel_targets
-import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from jax import lax
+from llvmlite import binding
 
 from jaxgrasp import kernels
 from jaxgrasp.kernels import primitive
-from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.code import llvm
 from jaxgrasp.kernels.cpu import module as cpu
-from jaxgrasp.kernels.program.lowering import lowered
+from jaxgrasp.kernels.program.lowering import lower
 
 TARGETS = kernel_targets.targets()
 
@@ -56,7 +56,7 @@ def inputs(dtype: str):
     return jnp.asarray(rng.normal(size=(90, 3)), dtype), jnp.asarray(rng.random((90, 2)) < 0.5)
 
 
-def ran(target: machine.Machine, dtype: str) -> tuple[list[dict[str, np.ndarray]], str]:
+def ran(target: llvm.Processor, dtype: str) -> tuple[list[dict[str, np.ndarray]], str]:
     """Three calls, and the kernel's code."""
     run = partial(primitive.fused, shared=(False, False), otherwise=lambda _: None)
     with kernel_targets.compiled_for(target) as texts:
@@ -92,15 +92,15 @@ def test_spoilt_memory_changes_nothing(target, dtype):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_code_for_avx_512_reads_what_it_wrote_and_compiles_anywhere(dtype):
     given = [jax.ShapeDtypeStruct((*x.shape[1:], 1), x.dtype) for x in inputs(dtype)]
-    program = lowered(jax.make_jaxpr(function)(given), [False, False])
-    text = cpu.module(program, "here", 64 // jnp.dtype(dtype).itemsize, estimates=True)
+    program = lower(jax.make_jaxpr(function)(given), [False, False])
+    text = cpu.write_module(program, "here", 64 // jnp.dtype(dtype).itemsize, estimates=True)
     assert frame_reads.unwritten(text) == []
-    triple = llvm.get_process_triple()
+    triple = binding.get_process_triple()
     if not triple.startswith("x86_64"):
         pytest.skip("LLVM here is for other processors")
-    module = llvm.parse_assembly(text)
+    module = binding.parse_assembly(text)
     module.triple = triple
-    target = llvm.Target.from_triple(triple).create_target_machine(cpu="skylake-avx512", features="-prefer-256-bit")
+    target = binding.Target.from_triple(triple).create_target_machine(cpu="skylake-avx512", features="-prefer-256-bit")
     assert "zmm" in target.emit_assembly(module)
 
 
@@ -180,9 +180,11 @@ entry:
 @pytest.mark.parametrize("target", TARGETS)
 def test_a_kernel_that_forgets_to_move_something_answers_wrongly(target, monkeypatch):
     """With spoilt memory, what a lane that waits lacks is seen in its answer: the tests of widths can fail."""
-    alive = cpu.VectorCode.alive
+    collect = cpu.VectorCode.collect_lane_state
     monkeypatch.setattr(
-        cpu.VectorCode, "alive", lambda *args: {at: kind for at, kind in alive(*args).items() if kind != "b"}
+        cpu.VectorCode,
+        "collect_lane_state",
+        lambda *args: {at: kind for at, kind in collect(*args).items() if kind != "b"},
     )
     # Of two lanes none waits.
     dtype = "float32" if TARGETS[target].vector_bytes == 16 else "float64"

@@ -21,8 +21,8 @@ import jaxgrasp as jg
 from jaxgrasp import kernels
 from jaxgrasp.geometry.pairs.geom import Touch
 from jaxgrasp.kernels import primitive
-from jaxgrasp.kernels.code import llvm as machine
-from jaxgrasp.kernels.store import outline
+from jaxgrasp.kernels.code import llvm
+from jaxgrasp.kernels.store import treedef
 
 SAME_MARGIN = {"float64": 2e-8, "float32": 1e-4}
 """Of max(|margin|, Lambda). In float32 both may be off by what the method accepts."""
@@ -136,11 +136,10 @@ print(float(out.sum()))
             "has no fused multiply-add",
         ),
         (
-            "from jaxgrasp.kernels import cpu\n"
-            "cpu.HANDLER = cpu.HANDLER.replace('uge i64 %api.size, 152', 'uge i64 %api.size, 9999')",
+            "from jaxgrasp.kernels.cpu import module as cpu\ncpu.API_BYTES = 9999\n",
             "hands arrays over in another way",
         ),
-        ("from jaxgrasp.kernels import cpu; cpu.HANDLER += 'nonsense'", "does not compile"),
+        ("from jaxgrasp.kernels.cpu import module as cpu; cpu.HANDLER += 'nonsense'", "does not compile"),
     ],
 )
 def test_where_there_are_none_one_warning_says_why(before, why, tmp_path):
@@ -159,18 +158,18 @@ def test_the_setting(monkeypatch, tmp_path):
 
 
 def test_vectors_are_as_long_as_asked_for(monkeypatch):
-    known = machine.with_vectors(None)
-    monkeypatch.setenv(machine.SETTING, "128")
-    short = machine.machine.__wrapped__()
+    known = llvm.processor_with(None)
+    monkeypatch.setenv(llvm.SETTING, "128")
+    short = llvm.processor.__wrapped__()
     assert short.vector_bytes == 16 and not short.estimates and not short.spoilt
     # Kernels are kept by this.
     assert (short.description == known.description) == (known.vector_bytes == 16)
-    monkeypatch.setenv(machine.SETTING, "64")
+    monkeypatch.setenv(llvm.SETTING, "64")
     with pytest.raises(ValueError, match="JAXGRASP_VECTOR_BITS: got '64', wanted auto, 128, 256 or 512"):
-        machine.machine.__wrapped__()
+        llvm.processor.__wrapped__()
     if known.vector_bytes < 64:
-        with pytest.raises(machine.Unavailable, match="vectors of 512 bits are asked for"):
-            machine.with_vectors(512)
+        with pytest.raises(llvm.Unavailable, match="vectors of 512 bits are asked for"):
+            llvm.processor_with(512)
 
 
 def test_kernels_are_kept_on_disk(tmp_path):
@@ -179,7 +178,7 @@ def test_kernels_are_kept_on_disk(tmp_path):
     folder = tmp_path / "jaxgrasp" / "kernels"
     kept = sorted(folder.iterdir())
     assert len(kept) == 3 and folder.stat().st_mode & 0o077 == 0
-    no_compiling = "from jaxgrasp.kernels import machine; machine.compiled = None"
+    no_compiling = "from jaxgrasp.kernels.code import llvm; llvm.compile_module = None"
     assert run(no_compiling + SMALL, XDG_CACHE_HOME=str(tmp_path)).stdout.strip() == "12.0"
     # What is cut short, belongs to another key, or could come from others, is not used.
     whole = [file.read_bytes() for file in kept]
@@ -189,7 +188,7 @@ def test_kernels_are_kept_on_disk(tmp_path):
         assert run(SMALL, XDG_CACHE_HOME=str(tmp_path)).stdout.strip() == "12.0"
         assert [file.read_bytes() for file in kept] == whole
     folder.chmod(0o777)
-    monkey = "from jaxgrasp.kernels.store import folder; print(folder.cached('" + kept[0].name + "'))"
+    monkey = "from jaxgrasp.kernels.store import folder; print(folder.read('" + kept[0].name + "'))"
     assert run(monkey, XDG_CACHE_HOME=str(tmp_path)).stdout.strip() == "None"
 
 
@@ -225,28 +224,28 @@ def test_a_folder_that_cannot_be_written(tmp_path):
 
 
 def test_a_warning_is_not_repeated():
-    primitive._tell.cache_clear()
+    primitive._warn.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        primitive._tell("a reason")
-        primitive._tell("a reason")
+        primitive._warn("a reason")
+        primitive._warn("a reason")
     assert len(told) == 1
 
 
-def test_outlines_are_data():
+def test_structures_of_results_are_data():
     """What is kept beside a kernel names records of this package, and nothing that does something."""
     point = Touch(position=np.zeros((3, 1)), normal=np.zeros((3, 1)), distance=np.zeros(1))
     tree = {"a": [np.zeros((3, 1), np.float32), None], "b": (np.zeros(2, bool),), "c": point}
-    again = outline.read(outline.written(tree))
+    again = treedef.read(treedef.write(tree))
     assert jax.tree.structure(again) == jax.tree.structure(tree)
     for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(tree), strict=True):
         assert one.shape == other.shape and one.dtype == other.dtype
-    assert outline.read(outline.written({"edges": 8})) == {"edges": 8}
+    assert treedef.read(treedef.write({"edges": 8})) == {"edges": 8}
     for content in (
         b'{"class": ["os", "system"], "fields": {"command": null}}',
-        b'{"class": ["jaxgrasp.kernels.code.llvm", "keep"], "fields": {"key": null, "objects": null}}',
+        b'{"class": ["jaxgrasp.kernels.store.folder", "keep"], "fields": {"key": null, "content": null}}',
         b"[]",
         b"no JSON",
     ):
         with pytest.raises(ValueError):
-            outline.read(content)
+            treedef.read(content)

@@ -1,1 +1,1 @@
-"""LLVM text for scalar operations, common to all processors."""
+"""The back of the compiler that all targets have in common: LLVM text, LLVM itself, and XLA's interface."""

@@ -1,4 +1,4 @@
-"""Instructions on vectors, as text of LLVM's language.
+"""Write instructions on vectors, as text of LLVM's language.
 
 The text is written here rather than with a library's objects, which would take longer than LLVM takes to compile it.
 """
@@ -8,79 +8,90 @@ from typing import Any
 
 import numpy as np
 
-# Bytes of a frame that AVX-512's instructions reach from a pointer with one byte in place of four, and how many such
-# pointers are kept. A kernel's loop is more code than the first cache holds.
+# Bytes of a frame that AVX-512's instructions reach from a pointer with an offset of one byte in place of four, and how
+# many such pointers are kept. Short offsets matter, since a kernel's loop is more code than the first cache holds.
 _NEAR, _POINTERS = 1 << 14, 7
 
 
 class Instructions:
-    """Writes instructions.
+    """Writes functions, one after the other, and lays out their frame, the memory that they share.
+
+    `begin` starts a function; instructions go to the one that began last. `text` comes last: only then is it known how
+    large the frame is, and every function begins with pointers into it.
 
     Args:
         dtype: of numbers.
         width: lanes of a vector.
         estimates: whether the processor has AVX-512's estimates of reciprocals.
+
+    types: LLVM's types of vectors of numbers "f", integers "i", truth values "b" and bytes, and of the integer "u".
+    memory_types: the types that these have in memory.
+    units: LLVM's types of single entries in memory.
+    functions: signature and lines of every function.
+    lines: of the function that is being written.
+    block: the block that is being written.
+    offsets: where each array of the frame begins, in bytes.
+    frame_bytes: how large the frame is so far.
+    declarations: of LLVM's functions that are called.
     """
 
     def __init__(self, dtype: np.dtype, width: int, *, estimates: bool) -> None:
-        """See the class."""
+        """Begin a module without functions."""
         self.dtype, self.width, self.estimates = dtype, width, estimates
         self.scalar = "double" if dtype.itemsize == 8 else "float"
         self.types = {"f": f"<{width} x {self.scalar}>", "i": f"<{width} x i32>", "b": f"<{width} x i1>", "u": "i64"}
         self.types["byte"] = f"<{width} x i8>"
         # In memory a truth value is a byte: of a vector of bits that fill no byte, LLVM takes the others for zero.
-        self.kept = {**self.types, "b": self.types["byte"]}
+        self.memory_types = {**self.types, "b": self.types["byte"]}
         self.units = {"f": self.scalar, "i": "i32", "byte": "i8"}
         self.functions: list[tuple[str, list[str]]] = []
         self.lines: list[str] = []
-        self.begun: Callable[[], None] = lambda: None
         self.offsets: dict[str, int] = {}
-        self.used = 0
+        self.frame_bytes = 0
         self.declarations: set[str] = set()
         self.block = "entry"
         self.count = 0
 
     def emit(self, text: str) -> str:
-        """An instruction with a result."""
+        """Write an instruction with a result; return the result's name."""
         self.count += 1
         name = f"%v{self.count}"
         self.lines.append(f"{name} = {text}")
         return name
 
     def do(self, text: str) -> None:
-        """An instruction without one."""
+        """Write an instruction without a result."""
         self.lines.append(text)
 
     def label(self, purpose: str) -> str:
-        """A new name for a block."""
+        """Return a new name for a block."""
         self.count += 1
         return f"{purpose}{self.count}"
 
     def enter(self, block: str) -> None:
-        """Begin a block."""
+        """Begin a block of the function."""
         self.lines.append(f"{block}:")
         self.block = block
 
     def allocate(self, kind: str, count: int = 1) -> str:
-        """Memory in the frame for vectors; its name is for `pointer`."""
+        """Reserve memory for vectors in the frame; return its name, which is for `pointer`."""
         self.count += 1
         name = f"%m{self.count}"
-        self.offsets[name] = self.used
-        self.used += -(-count * self.stride(kind) // 64) * 64
+        self.offsets[name] = self.frame_bytes
+        self.frame_bytes += -(-count * self.stride(kind) // 64) * 64
         return name
 
     def stride(self, kind: str) -> int:
-        """Bytes from one vector of an array to the next."""
+        """Return how many bytes apart the vectors of an array are."""
         return self.width * (self.dtype.itemsize if kind == "f" else 4 if kind == "i" else 1)
 
     def begin(self, signature: str) -> None:
-        """A new function; it has a pointer `%frame` to a block's memory."""
+        """Begin a function, which must have a pointer `%frame` among its parameters."""
         self.functions.append((signature, []))
         self.lines, self.block = self.functions[-1][1], "entry"
-        self.begun()
 
-    def written(self) -> str:
-        """All functions."""
+    def text(self) -> str:
+        """Return the code of all functions."""
         pointers = "\n".join(self._pointers())
         return "\n".join(
             f"define internal {signature} #0 {{\nentry:\n{pointers}\n" + "\n".join(lines) + "\n}\n"
@@ -88,9 +99,9 @@ class Instructions:
         )
 
     def _pointers(self) -> list[str]:
-        """The code with which a function begins: pointers into the frame."""
+        """Return the lines with which a function begins: pointers into the frame."""
         lines = []
-        for number in range(min(_POINTERS, -(-max(self.used, 1) // _NEAR))):
+        for number in range(min(_POINTERS, -(-max(self.frame_bytes, 1) // _NEAR))):
             place = f"getelementptr i8, ptr %frame, i64 {number * _NEAR + _NEAR // 2}"
             # LLVM would count all of them from the same one if it knew.
             lines += [f"%near{number}.known = {place}"]
@@ -98,7 +109,7 @@ class Instructions:
         return lines
 
     def pointer(self, place: str) -> str:
-        """Address of memory in the frame; others' are returned as they are."""
+        """Write a pointer to an array of the frame; other pointers are returned as they are."""
         offset = self.offsets.get(place)
         if offset is None:
             return place
@@ -106,15 +117,15 @@ class Instructions:
         return self.emit(f"getelementptr i8, ptr %near{number}, i64 {offset - number * _NEAR - _NEAR // 2}")
 
     def declare(self, text: str) -> None:
-        """A function of LLVM's that is called."""
+        """Declare a function of LLVM's that is called."""
         self.declarations.add(text)
 
     def entry(self, base: str, unit: str, index: str | int) -> str:
-        """Address of an entry."""
+        """Write a pointer to an entry of an array."""
         return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {index}")
 
     def repeat(self, count: int | str, body: Callable[[str], None]) -> None:
-        """`body(number)` so many times, at least once."""
+        """Write a loop of at least one round; `body` writes a round, and is called with the name of its number."""
         before, inside, after = self.block, self.label("repeat"), self.label("after")
         self.do(f"br label %{inside}")
         self.enter(inside)
@@ -129,7 +140,7 @@ class Instructions:
         self.enter(after)
 
     def constant(self, value: Any, kind: str) -> str:
-        """A literal."""
+        """Return the literal of a constant of this type, the same in all lanes."""
         if kind == "f":
             return f"splat ({self.scalar} {self.float_literal(value)})" if self.width > 1 else self.float_literal(value)
         if kind == "b":
@@ -137,43 +148,48 @@ class Instructions:
         return str(int(value)) if kind == "u" else f"splat (i32 {int(value)})"
 
     def float_literal(self, value: Any) -> str:
-        """As LLVM reads it without rounding."""
+        """Return a number as LLVM reads it without rounding."""
         return f"0x{np.float64(self.dtype.type(value)).view(np.uint64):016X}"
 
     def intrinsic(self, name: str, *operands: str) -> str:
-        """A call of one of LLVM's own functions of vectors."""
+        """Write a call of one of LLVM's own functions of vectors."""
         vector = self.types["f"]
         full = f"@llvm.{name}.v{self.width}f{8 * self.dtype.itemsize}"
         self.declare(f"declare {vector} {full}({', '.join([vector] * len(operands))})")
         return self.emit(f"call {vector} {full}({', '.join(f'{vector} {x}' for x in operands)})")
 
     def multiply_add(self, a: str, b: str, c: str) -> str:
-        """The sum a b + c, rounded once."""
+        """Write a b + c, rounded once."""
         return self.intrinsic("fma", a, b, c)
 
-    def negative(self, x: str) -> str:
-        """The value -x."""
+    def negate(self, x: str) -> str:
+        """Write -x."""
         return self.emit(f"fneg {self.types['f']} {x}")
 
-    def times(self, a: str, b: str) -> str:
-        """The product a b."""
+    def multiply(self, a: str, b: str) -> str:
+        """Write a b."""
         return self.emit(f"fmul {self.types['f']} {a}, {b}")
 
     def estimate(self, name: str, x: str) -> str:
-        """AVX-512's estimate of 1/x or 1/sqrt(x), good to 14 bits."""
+        """Write AVX-512's estimate of 1 / x ("rcp") or 1 / sqrt(x) ("rsqrt"), good to 14 bits."""
         vector, mask = self.types["f"], f"i{max(8, self.width)}"
         full = f"@llvm.x86.avx512.{name}14.{'pd' if self.dtype.itemsize == 8 else 'ps'}.512"
         self.declare(f"declare {vector} {full}({vector}, {vector}, {mask})")
         return self.emit(f"call {vector} {full}({vector} {x}, {vector} zeroinitializer, {mask} -1)")
 
-    def improved(self, inverse: str, lacking: str, step: str, where: str | None) -> tuple[str, str]:
-        """One step of Newton's; none where the estimate is exact: x is zero, infinite or NaN, or as good as that.
+    def improve(self, inverse: str, lacking: str, step: str, where: str | None) -> tuple[str, str]:
+        """Write a step of Newton's method, inverse + step * lacking, except where the estimate is exact.
+
+        It is exact where x is zero, infinite or NaN, or too small or large: `lacking` is then NaN or minus infinity.
 
         Args:
-            inverse: what is improved.
-            lacking: by which share it is short.
-            step: what a unit of this share is worth.
-            where: it is to be done, None if that is not known yet; returned as well.
+            inverse: the estimate of 1 / x or 1 / sqrt(x).
+            lacking: its residual, 1 - x inverse or 1 - x inverse^2.
+            step: the derivative of the correction with respect to the residual.
+            where: the mask of lanes to improve; None to find it.
+
+        Returns:
+            The better estimate, and the mask.
         """
         vector = self.types["f"]
         mask = where or self.emit(f"fcmp ogt {vector} {lacking}, {self.constant(-1, 'f')}")
@@ -181,33 +197,33 @@ class Instructions:
         return self.emit(f"select {self.types['b']} {mask}, {vector} {better}, {vector} {inverse}"), mask
 
     def reciprocal(self, x: str) -> str:
-        """The reciprocal 1 / x."""
+        """Write 1 / x."""
         one = self.constant(1, "f")
         if not self.estimates:
             return self.emit(f"fdiv {self.types['f']} {one}, {x}")
-        inverse, minus, mask = self.estimate("rcp", x), self.negative(x), None
+        inverse, minus, mask = self.estimate("rcp", x), self.negate(x), None
         for _ in range(2 if self.dtype.itemsize == 8 else 1):
-            inverse, mask = self.improved(inverse, self.multiply_add(minus, inverse, one), inverse, mask)
+            inverse, mask = self.improve(inverse, self.multiply_add(minus, inverse, one), inverse, mask)
         return inverse
 
     def inverse_root(self, x: str) -> str:
-        """1 / sqrt(x)."""
+        """Write 1 / sqrt(x)."""
         if not self.estimates:
             return self.reciprocal(self.intrinsic("sqrt", x))
         inverse, mask = self.estimate("rsqrt", x), None
         for _ in range(2 if self.dtype.itemsize == 8 else 1):
-            # In this order nothing is too small for an ordinary number.
-            minus = self.negative(self.times(x, inverse))
+            # 1 - (x y) y rather than 1 - x (y y): y y would be denormal for large x.
+            minus = self.negate(self.multiply(x, inverse))
             lacking = self.multiply_add(minus, inverse, self.constant(1, "f"))
-            inverse, mask = self.improved(inverse, lacking, self.times(inverse, self.constant(0.5, "f")), mask)
+            inverse, mask = self.improve(inverse, lacking, self.multiply(inverse, self.constant(0.5, "f")), mask)
         return inverse
 
     def root(self, x: str) -> str:
-        """The root: x / sqrt(x), and one step towards the root."""
+        """Write sqrt(x), as x / sqrt(x) and a step of Newton's method; sqrt(0) = 0 and sqrt(inf) = inf."""
         inverse = self.inverse_root(x)
-        root = self.times(x, inverse)
-        lacking = self.multiply_add(self.negative(root), root, x)
-        root = self.multiply_add(lacking, self.times(inverse, self.constant(0.5, "f")), root)
+        root = self.multiply(x, inverse)
+        lacking = self.multiply_add(self.negate(root), root, x)
+        root = self.multiply_add(lacking, self.multiply(inverse, self.constant(0.5, "f")), root)
         vector, mask = self.types["f"], self.types["b"]
         empty = self.emit(f"fcmp oeq {vector} {x}, zeroinitializer")
         endless = self.emit(f"fcmp oeq {vector} {x}, {self.constant(np.inf, 'f')}")

@@ -1,4 +1,4 @@
-"""LLVM for the processor at hand: its target, its options, object code and what becomes of it."""
+"""LLVM for the processor at hand: its options, object code, and loading of that code."""
 
 import contextlib
 import ctypes
@@ -8,25 +8,25 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 SETTING = "JAXGRASP_VECTOR_BITS"
-# What narrower vectors than the processor's are made without.
+# The features that are switched off for vectors narrower than the processor's, by the bits of a vector.
 _WITHOUT = {128: ",-avx2", 256: ",-avx512f", 512: ""}
 
 
 class Unavailable(Exception):
-    """Why there are no fused kernels here."""
+    """Fused kernels cannot be compiled here; the message says why."""
 
 
-class Machine(NamedTuple):
-    """A processor.
+class Processor(NamedTuple):
+    """A processor that kernels are compiled for.
 
-    target: LLVM's target machine.
+    target_machine: LLVM's target machine.
     vector_bytes: size of a vector register.
-    estimates: whether it has AVX-512's estimates of reciprocals.
+    estimates: whether the processor has AVX-512's estimates of reciprocals.
     description: everything that compiled code depends on.
-    spoilt: whether all bits of a thread's memory are set before each use, so that tests see what is read unwritten.
+    spoilt: whether all bits of a thread's memory are set before each use, so that tests see reads of unwritten memory.
     """
 
-    target: Any
+    target_machine: Any
     vector_bytes: int
     estimates: bool
     description: str
@@ -34,21 +34,21 @@ class Machine(NamedTuple):
 
 
 @functools.cache
-def machine() -> Machine:
-    """The processor at hand, with vectors as long as the environment asks for, else as long as they can be.
+def processor() -> Processor:
+    """Describe the processor at hand, with vectors of JAXGRASP_VECTOR_BITS; the longest if that is unset or "auto".
 
     Raises:
-        Unavailable: see `with_vectors`.
-        ValueError: the environment asks for what is not known.
+        Unavailable: see `processor_with`.
+        ValueError: JAXGRASP_VECTOR_BITS is none of auto, 128, 256 and 512.
     """
     asked = os.environ.get(SETTING, "auto")
     if asked not in ("auto", *map(str, _WITHOUT)):
         raise ValueError(f"{SETTING}: got {asked!r}, wanted auto, 128, 256 or 512")
-    return with_vectors(None if asked == "auto" else int(asked))
+    return processor_with(None if asked == "auto" else int(asked))
 
 
-def with_vectors(bits: int | None) -> Machine:
-    """The processor at hand, with vectors of so many bits; None for the longest.
+def processor_with(bits: int | None) -> Processor:
+    """Describe the processor at hand, with vectors of so many bits; None for the longest.
 
     Raises:
         Unavailable: no llvmlite, a processor without fused multiply-add, or without such vectors.
@@ -81,11 +81,11 @@ def with_vectors(bits: int | None) -> Machine:
         target = llvm.Target.from_triple(triple).create_target_machine(cpu=name, features=flags, opt=1)
     except RuntimeError as error:
         raise Unavailable(f"LLVM does not know the processor: {error}") from None
-    return Machine(target, bits // 8, bits == 512, f"{llvmlite.__version__} {triple} {name} {flags}")
+    return Processor(target, bits // 8, bits == 512, f"{llvmlite.__version__} {triple} {name} {flags}")
 
 
-def compiled(code: str) -> bytes:
-    """Object code of a module.
+def compile_module(code: str) -> bytes:
+    """Compile a module of LLVM code to object code for the processor at hand.
 
     Raises:
         RuntimeError: LLVM does not accept it.
@@ -95,18 +95,18 @@ def compiled(code: str) -> bytes:
     module = llvm.parse_assembly(code)
     module.triple = llvm.get_process_triple()
     with in_given_order():
-        return machine().target.emit_object(module)
+        return processor().target_machine.emit_object(module)
 
 
-# LLVM ends the process where it does not know an option; later versions have to be looked at.
+# The versions that have the option: LLVM ends the process where it does not know one.
 _KNOWN_LLVM = range(18, 23)
 
 
 @contextlib.contextmanager
 def in_given_order() -> Iterator[None]:
-    """Without LLVM's own order of instructions, which moves results away from where they are used.
+    """Switch off LLVM's scheduling of machine instructions, which moves results away from where they are used.
 
-    It takes a third of the compile time, and half as many loads and stores again.
+    It would take a third of the compile time, and make half as many loads and stores again.
     """
     import llvmlite.binding as llvm
 
@@ -123,8 +123,8 @@ def in_given_order() -> Iterator[None]:
 _engines: list[Any] = []
 
 
-def loaded(objects: bytes, name: str) -> int:
-    """Address of a function in object code, which stays loaded."""
+def load(objects: bytes, name: str) -> int:
+    """Load object code for as long as the process lasts; return the address of one of its functions."""
     import llvmlite.binding as llvm
 
     empty = llvm.parse_assembly("")
@@ -138,7 +138,7 @@ def loaded(objects: bytes, name: str) -> int:
 
 
 def capsule(address: int) -> Any:
-    """A function pointer as XLA takes it."""
+    """Wrap a function's address in the capsule that XLA takes."""
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     return new(address, None, None)

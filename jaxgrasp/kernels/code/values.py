@@ -1,4 +1,4 @@
-"""Instructions for values: what vectors of problems and single ones have in common."""
+"""Write instructions for values: what targets with vectors of lanes and targets with single ones have in common."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxgrasp.kernels.code.instructions import Instructions
-from jaxgrasp.kernels.program.expressions import Value
+from jaxgrasp.kernels.program.expressions import Address, Value
 from jaxgrasp.kernels.program.lowering import Guard, Loop
 
 _INTEGERS = {"add": "add", "sub": "sub", "mul": "mul"}
@@ -19,14 +19,14 @@ _INTRINSICS = {"sqrt": "sqrt", "exp": "exp", "log": "log", "floor": "floor", "ab
 class ValueCode(Instructions, ABC):
     """Writes instructions for values, whose operands have names.
 
-    own: where each argument lies that every problem has for itself.
-    fused: products that are part of a sum.
-    slots: of every step, where or by which names its carried values or results are found.
-    labels: of every step, its blocks: before it, inside and after.
+    own: names of the pointers to the arguments, see `write` of the subclass.
+    fused: products that are part of a fused multiply-add.
+    slots: for every loop and guard, the places or names of its carried values or results.
+    labels: for every loop and guard, the names of its blocks: the head, inside and after.
     """
 
     def __init__(self, dtype: np.dtype, width: int, *, estimates: bool) -> None:
-        """See `Instructions`."""
+        """Begin code for vectors of so many lanes, see `Instructions`."""
         super().__init__(dtype, width, estimates=estimates)
         self.own: list[str] = []
         self.fused: set[Value] = set()
@@ -35,15 +35,15 @@ class ValueCode(Instructions, ABC):
 
     @abstractmethod
     def operand(self, x: Any, kind: str) -> str:
-        """The name or literal of a scalar."""
+        """Return the name or literal of a scalar as an operand of this type."""
 
     def choice(self, value: Value, mask: str) -> str:
-        """A select, by a mask that is written already."""
+        """Write a select, by a mask that is written already."""
         picked = [f"{self.types[value.kind]} {self.operand(x, value.kind)}" for x in value.args[1:]]
         return self.emit(f"select {self.types['b']} {mask}, {', '.join(picked)}")
 
     def instruction(self, value: Value) -> str:
-        """The code of one value."""
+        """Write the code of a value that is computed; return its name."""
         op, args, kind = value.op, value.args, value.kind
         vector = self.types[kind]
         if op in _FLOAT_CONDITIONS:
@@ -71,7 +71,7 @@ class ValueCode(Instructions, ABC):
         return self.number(op, args, operands)
 
     def comparison(self, op: str, args: tuple) -> str:
-        """A mask."""
+        """Write a comparison."""
         kinds = {x.kind if type(x) is Value else None for x in args} - {None}
         kind = "f" if "f" in kinds else "b" if "b" in kinds else "i"
         left, right = (self.operand(x, kind) for x in args)
@@ -79,7 +79,7 @@ class ValueCode(Instructions, ABC):
         return self.emit(f"{how} {self.types[kind]} {left}, {right}")
 
     def integer(self, op: str, vector: str, operands: list[str], kind: str) -> str:
-        """An operation on integers."""
+        """Write an operation on integers."""
         if op in ("max", "min"):
             truth = "i1" if kind == "u" else self.types["b"]
             first = self.emit(f"icmp {'sgt' if op == 'max' else 'slt'} {vector} {operands[0]}, {operands[1]}")
@@ -89,14 +89,14 @@ class ValueCode(Instructions, ABC):
         return self.emit(f"{_INTEGERS[op]} {vector} {', '.join(operands)}")
 
     def number(self, op: str, args: tuple, operands: list[str]) -> str:
-        """An operation on numbers."""
+        """Write an operation on numbers."""
         vector = self.types["f"]
         if op in _FLOATS:
             return self.emit(f"{_FLOATS[op]} {vector} {', '.join(operands)}")
         if op == "neg":
             return self.emit(f"fneg {vector} {operands[0]}")
         if op in ("max", "min"):
-            # One instruction; of a constant and NaN it gives NaN.
+            # This order becomes one instruction, and gives NaN for NaN and a constant.
             if type(args[1]) is not Value:
                 operands.reverse()
             first = self.emit(f"fcmp {'ogt' if op == 'max' else 'olt'} {vector} {operands[0]}, {operands[1]}")
@@ -110,18 +110,17 @@ class ValueCode(Instructions, ABC):
         return self.intrinsic(_INTRINSICS[op], operands[0])
 
     def sum_of_product(self, op: str, product: Value, args: tuple) -> str:
-        """A sum or difference with a product, rounded once."""
+        """Write a sum or difference with a product, rounded once."""
         a, b = (self.operand(x, "f") for x in product.args)
         first = args[0] is product
         other = self.operand(args[1] if first else args[0], "f")
         if op == "sub":
-            other, a = (self.negative(other), a) if first else (other, self.negative(a))
+            other, a = (self.negate(other), a) if first else (other, self.negate(a))
         return self.multiply_add(a, b, other)
 
-    def offset(self, index: tuple) -> str:
-        """Which entry of an array: a known one, or so many strides further as a counter says."""
-        known, counter, stride = index
-        if counter is None:
-            return str(known)
-        moved = self.emit(f"mul i64 {self.operand(counter, 'u')}, {stride}")
-        return self.emit(f"add i64 {moved}, {known}")
+    def offset(self, address: Address) -> str:
+        """Write the number of the entry at an address: known, or so many strides further as a counter says."""
+        if address.counter is None:
+            return str(address.offset)
+        moved = self.emit(f"mul i64 {self.operand(address.counter, 'u')}, {address.stride}")
+        return self.emit(f"add i64 {moved}, {address.offset}")

@@ -1,1 +1,1 @@
-"""Kernels for CPUs: vectors of lanes."""
+"""The CPU target: kernels with one lane of the batch per lane of a vector register."""

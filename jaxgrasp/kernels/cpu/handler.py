@@ -1,9 +1,20 @@
 """The handler that XLA calls, and how its threads share the blocks of a call: LLVM code around that of a block.
 
-The offsets are those of xla/ffi/api/c_api.h, version 0.3. Where a structure is smaller than what is read from it, the
-handler does nothing at all: the caller finds its results untouched. Whoever calls waits only for blocks that a running
-thread has taken; a thread that comes late finds none left, and the last one to leave frees the call's data.
+Where one of XLA's structures is smaller than what is read from it, the handler does nothing at all: the caller finds
+its results untouched. The calling thread waits only for blocks that a running thread has taken; a thread that comes
+late finds none left, and the last one to leave frees the call's state.
+
+The state of a call, which its threads share, is an array of words: the number of rows, of blocks, the next block, how
+many blocks are done, how many threads use the state, and how many blocks a thread takes at a time; then the pointers to
+the arguments' data and to the results'.
 """
+
+from jaxgrasp.kernels.code.ffi import Api
+
+# How much of `XLA_FFI_Api` the handler reads.
+API_BYTES = Api.THREAD_POOL_NUM_THREADS + 8
+# Where the pointers begin in the state of a call, in words.
+POINTERS = 6
 
 HANDLER = """
 declare ptr @malloc(i64)
@@ -18,9 +29,9 @@ declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)
 define internal void @take(ptr %state) {
 entry:
   %frame = alloca [@FRAME_BYTES@ x i8], align 64
-  %rest = alloca [@REST_BYTES@ x i8], align 64
-  %book = alloca [@BOOK@ x i64]
-  store i64 0, ptr %book
+  %spill = alloca [@SPILL_BYTES@ x i8], align 64
+  %queue = alloca [@QUEUE_WORDS@ x i64]
+  store i64 0, ptr %queue
   %blocks.p = getelementptr i64, ptr %state, i64 1
   %next.p = getelementptr i64, ptr %state, i64 2
   %done.p = getelementptr i64, ptr %state, i64 3
@@ -41,7 +52,7 @@ work:
 one:
   %number = phi i64 [ %from, %work ], [ %following, %one ]
 @SPOIL@
-  call void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book)
+  call void @block(ptr %state, i64 %number, ptr %frame, ptr %spill, ptr %queue)
   %following = add i64 %number, 1
   %again = icmp ult i64 %following, %to
   br i1 %again, label %one, label %counted
@@ -50,7 +61,7 @@ counted:
   %taken = add i64 %before, %share
   br label %more
 out:
-  call void @finish(ptr %state, ptr %rest, ptr %book)
+  call void @finish(ptr %state, ptr %spill, ptr %queue)
   %done = atomicrmw add ptr %done.p, i64 %before release
   ret void
 }
@@ -73,51 +84,18 @@ define internal void @help(ptr %state) {
   call void @leave(ptr %state)
   ret void
 }
-
-define internal ptr @field(ptr %base, i64 %offset) alwaysinline {
-  %p = getelementptr i8, ptr %base, i64 %offset
-  %v = load ptr, ptr %p
-  ret ptr %v
-}
-
-define ptr @NAME@(ptr %frame) {
-entry:
-  %extension = call ptr @field(ptr %frame, i64 8)
-  %asked = icmp ne ptr %extension, null
-  br i1 %asked, label %describe, label %check
-describe:
-  %metadata = call ptr @field(ptr %extension, i64 24)
-  %major.p = getelementptr i8, ptr %metadata, i64 24
-  %minor.p = getelementptr i8, ptr %metadata, i64 28
-  store i32 0, ptr %major.p
-  store i32 3, ptr %minor.p
-  ret ptr null
-check:
-  %frame.size = load i64, ptr %frame
-  %api = call ptr @field(ptr %frame, i64 16)
-  %api.size = load i64, ptr %api
-  %api.major.p = getelementptr i8, ptr %api, i64 32
-  %api.major = load i32, ptr %api.major.p
-  %frame.fits = icmp uge i64 %frame.size, 120
-  %api.fits = icmp uge i64 %api.size, 152
-  %major.fits = icmp eq i32 %api.major, 0
-  %both = and i1 %frame.fits, %api.fits
-  %fits = and i1 %both, %major.fits
-  br i1 %fits, label %begin, label %nothing
-nothing:
-  ret ptr null
-begin:
+@PREAMBLE@
   %state = call ptr @malloc(i64 @STATE_BYTES@)
-  %arguments = call ptr @field(ptr %frame, i64 72)
-  %results = call ptr @field(ptr %frame, i64 112)
-  %context = call ptr @field(ptr %frame, i64 24)
+  %arguments = call ptr @field(ptr %frame, i64 @CallFrame.ARGUMENTS@)
+  %results = call ptr @field(ptr %frame, i64 @CallFrame.RESULTS@)
+  %context = call ptr @field(ptr %frame, i64 @CallFrame.CONTEXT@)
   br label %argument
 argument:
   %a = phi i64 [ 0, %begin ], [ %a.next, %argument ]
   %a.p = getelementptr ptr, ptr %arguments, i64 %a
   %a.buffer = load ptr, ptr %a.p
-  %a.data = call ptr @field(ptr %a.buffer, i64 24)
-  %a.place = add i64 %a, 6
+  %a.data = call ptr @field(ptr %a.buffer, i64 @Buffer.DATA@)
+  %a.place = add i64 %a, @POINTERS@
   %a.slot = getelementptr i64, ptr %state, i64 %a.place
   store ptr %a.data, ptr %a.slot
   %a.next = add i64 %a, 1
@@ -127,7 +105,7 @@ result:
   %r = phi i64 [ 0, %argument ], [ %r.next, %result ]
   %r.p = getelementptr ptr, ptr %results, i64 %r
   %r.buffer = load ptr, ptr %r.p
-  %r.data = call ptr @field(ptr %r.buffer, i64 24)
+  %r.data = call ptr @field(ptr %r.buffer, i64 @Buffer.DATA@)
   %r.place = add i64 %r, @FIRST_RESULT@
   %r.slot = getelementptr i64, ptr %state, i64 %r.place
   store ptr %r.data, ptr %r.slot
@@ -136,7 +114,7 @@ result:
   br i1 %r.more, label %result, label %share
 share:
   %first.buffer = load ptr, ptr %results
-  %dimensions = call ptr @field(ptr %first.buffer, i64 40)
+  %dimensions = call ptr @field(ptr %first.buffer, i64 @Buffer.DIMENSIONS@)
   %rows = load i64, ptr %dimensions
   %padded = add i64 %rows, @WIDTH@
   %almost = sub i64 %padded, 1
@@ -144,14 +122,14 @@ share:
   %count.p = alloca i64
   %question = alloca [4 x i64]
   store i64 1, ptr %count.p
-  store i64 32, ptr %question
+  store i64 @CallBytes.THREAD_POOL_NUM_THREADS@, ptr %question
   %question.1 = getelementptr i64, ptr %question, i64 1
   %question.2 = getelementptr i64, ptr %question, i64 2
   %question.3 = getelementptr i64, ptr %question, i64 3
   store i64 0, ptr %question.1
   store ptr %context, ptr %question.2
   store ptr %count.p, ptr %question.3
-  %threads.f = call ptr @field(ptr %api, i64 144)
+  %threads.f = call ptr @field(ptr %api, i64 @Api.THREAD_POOL_NUM_THREADS@)
   %error = call ptr %threads.f(ptr %question)
   %threads = load i64, ptr %count.p
   %alone = icmp slt i64 %threads, 1
@@ -162,8 +140,8 @@ share:
   %capped = select i1 %large, i64 @CHUNK@, i64 %even
   %none = icmp eq i64 %capped, 0
   %chunk = select i1 %none, i64 1, i64 %capped
-  %few = icmp ult i64 %blocks, %workers
-  %used = select i1 %few, i64 %blocks, i64 %workers
+  %fewer = icmp ult i64 %blocks, %workers
+  %used = select i1 %fewer, i64 %blocks, i64 %workers
   store i64 %rows, ptr %state
   %s1 = getelementptr i64, ptr %state, i64 1
   %s2 = getelementptr i64, ptr %state, i64 2
@@ -180,12 +158,12 @@ share:
   %task.2 = getelementptr i64, ptr %task, i64 2
   %task.3 = getelementptr i64, ptr %task, i64 3
   %task.4 = getelementptr i64, ptr %task, i64 4
-  store i64 40, ptr %task
+  store i64 @CallBytes.THREAD_POOL_SCHEDULE@, ptr %task
   store i64 0, ptr %task.1
   store ptr %context, ptr %task.2
   store ptr @help, ptr %task.3
   store ptr %state, ptr %task.4
-  %schedule.f = call ptr @field(ptr %api, i64 136)
+  %schedule.f = call ptr @field(ptr %api, i64 @Api.THREAD_POOL_SCHEDULE@)
   br label %call
 call:
   %t = phi i64 [ 1, %share ], [ %t.next, %called ], [ %t.next, %refused ]
@@ -220,8 +198,8 @@ attributes #0 = { nounwind }
 """
 
 # Before each block, for tests: no bit of its frame is what it was, nor of the second one where no lane waits there.
-SPOIL = """  %waiting = load i64, ptr %book
+SPOIL = """  %waiting = load i64, ptr %queue
   %nobody = icmp eq i64 %waiting, 0
-  %unused = select i1 %nobody, i64 @REST_BYTES@, i64 0
+  %unused = select i1 %nobody, i64 @SPILL_BYTES@, i64 0
   call void @llvm.memset.p0.i64(ptr %frame, i8 -1, i64 @FRAME_BYTES@, i1 false)
-  call void @llvm.memset.p0.i64(ptr %rest, i8 -1, i64 %unused, i1 false)"""
+  call void @llvm.memset.p0.i64(ptr %spill, i8 -1, i64 %unused, i1 false)"""

@@ -1,47 +1,94 @@
-"""LLVM code of a program: one problem per lane of a vector register."""
+"""Write LLVM code of a program: one lane of the batch per lane of a vector register."""
 
+import math
 from collections.abc import Callable
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from jaxgrasp.kernels.code.values import ValueCode
+from jaxgrasp.kernels.cpu.handler import POINTERS
 from jaxgrasp.kernels.cpu.registers import Registers
-from jaxgrasp.kernels.program.expressions import Value
-from jaxgrasp.kernels.program.lowering import Guard, Loop
+from jaxgrasp.kernels.program.expressions import Address, Value
+from jaxgrasp.kernels.program.lowering import Guard, Loop, ScalarProgram
 from jaxgrasp.kernels.program.schedule import Schedule, in_memory
 
 
-def main_loop(schedule: Schedule) -> Loop | None:
-    """The last loop that goes on for as long as any problem's condition holds and is in no other, if there is one."""
+class Body(NamedTuple):
+    """A description of a program's code for the functions around it.
+
+    width: lanes of a vector.
+    float_bytes: size of a number.
+    frame_bytes: size of the frame that the program works in.
+    has_main_loop: whether the program has a loop that some lanes take longer for, and with it the functions `rounds`
+        and `after`; else `before` is all.
+    lane_state: what a lane has in the frame where the main loop begins: types by offsets. It is moved with the lane.
+    """
+
+    width: int
+    float_bytes: int
+    frame_bytes: int
+    has_main_loop: bool
+    lane_state: dict[int, str]
+
+
+def find_main_loop(schedule: Schedule) -> Loop | None:
+    """Return the last loop of unknown length that is in no other loop; None if there is none."""
     loops = [e.subject for e in schedule.events if e.what == "test" and e.subject.body.depth == 1]
     return loops[-1] if loops else None
 
 
 class VectorCode(ValueCode):
-    """Writes instructions.
+    """Writes a program's functions, in five phases.
+
+    1. `begin` starts the function `before`. Like every function, it first loads the pointers to the arguments that all
+       lanes share.
+    2. The arrays of the arguments and results are allocated in the frame.
+    3. `write` writes the program. Where it has a main loop, `write` ends `before`, and begins and ends `rounds`, and
+       begins `after`; the caller ends the last one.
+    4. More functions may follow, which work on the same frame, but allocate nothing in it.
+    5. `text` returns the code.
 
     Args:
-        dtype: of numbers.
+        program: what to compute.
         width: lanes of a vector.
         estimates: whether the processor has AVX-512's estimates of reciprocals.
+
+    sizes: entries of a row of every argument.
+    shared: names of pointers to the arguments that all lanes share, in the function that is being written.
+    masks: for every loop of unknown length, the lanes whose condition holds in this round.
+    counters: for every loop of known length, the name of its counter, the block before it, and the line of the phi.
+    carried: for every next value of a carried scalar, the loop and the number of the scalar.
+    in_slots: next values of carried scalars that were stored in the slots of these.
+    conjunctions: names of the masks that `conjoin` wrote.
+    main_loop: the program's main loop, if it has one.
+    lane_state: see `Body`.
     """
 
-    def __init__(self, dtype: np.dtype, width: int, *, estimates: bool) -> None:
-        """See the class."""
-        super().__init__(dtype, width, estimates=estimates)
-        self.sizes: list[int] = []
+    def __init__(self, program: ScalarProgram, width: int, *, estimates: bool) -> None:
+        """Begin a module without functions."""
+        super().__init__(program.builder.dtype, width, estimates=estimates)
+        self.program = program
+        self.sizes = [math.prod(shape) for shape, _ in program.inputs]
         self.shared: list[str] = []
         self.masks: dict[Loop, str] = {}
         self.counters: dict[Loop, tuple[str, str, int]] = {}
         self.carried: dict[Value, tuple[Loop, int]] = {}
-        self.homes: set[Value] = set()
-        self.narrowed: dict[tuple[str, Value], str] = {}
-        self.main: Loop | None = None
-        self.live: dict[int, str] = {}
+        self.in_slots: set[Value] = set()
+        self.conjunctions: dict[tuple[str, Value], str] = {}
+        self.main_loop: Loop | None = None
+        self.lane_state: dict[int, str] = {}
+
+    def begin(self, signature: str) -> None:
+        """Begin a function, which must have pointers `%frame` and `%state`, see `handler`."""
+        super().begin(signature)
+        self.shared = [self.argument(number) if shared else "" for number, shared in enumerate(self.program.shared)]
+
+    def argument(self, number: int) -> str:
+        """Load the pointer to an argument's or a result's data; the results follow the arguments."""
+        place = self.emit(f"getelementptr i64, ptr %state, i64 {POINTERS + number}")
+        return self.emit(f"load ptr, ptr {place}")
 
     def operand(self, x: Any, kind: str) -> str:
-        """The name or literal of a scalar."""
+        """Return the name or literal of a scalar as an operand of this type."""
         if type(x) is not Value:
             return self.constant(x, kind)
         name = self.registers.fetch(x)
@@ -55,33 +102,42 @@ class VectorCode(ValueCode):
 
     # Events
 
-    def follow(self, schedule: Schedule, result: Callable[[int, str], None], registers: int) -> None:
-        """Write a whole program.
+    def write(self, schedule: Schedule, own: list[str], store: Callable[[int, str], None], registers: int) -> Body:
+        """Write the program into the function `before` that was begun; see the class.
 
         Args:
-            schedule: its events.
-            result: told the number and the name of every result.
+            schedule: the program's events.
+            own: the arrays of the arguments in the frame, "" where all lanes share one.
+            store: writes the code that stores a result; it is called with the result's number and name.
             registers: vector registers for values.
         """
-        self.fused, self.main = schedule.fused, main_loop(schedule)
+        self.own = own
+        self.fused, self.main_loop = schedule.fused, find_main_loop(schedule)
         self.registers = Registers(self, schedule, registers)
         for number, event in enumerate(schedule.events):
             if event.what == "compute":
                 self.compute(event.subject, number)
             elif event.what == "store":
-                result(event.subject, self.registers.fetch(event.uses[0]) if event.uses else "")
+                store(event.subject, self.registers.fetch(event.uses[0]) if event.uses else "")
             elif event.what == "test":
                 self.masks[event.subject] = self.operand(event.subject.condition, "b")
-                least = "%few" if event.subject is self.main else "0"
+                least = "%threshold" if event.subject is self.main_loop else "0"
                 self.branch_if_more(self.masks[event.subject], event.subject, least)
             elif isinstance(event.subject, Loop):
                 (self.enter_loop if event.what == "enter" else self.leave_loop)(event.subject, number)
             else:
                 (self.enter_guard if event.what == "enter" else self.leave_guard)(event.subject, number)
-            self.registers.passed(number)
+            self.registers.advance(number)
+        return Body(
+            width=self.width,
+            float_bytes=self.dtype.itemsize,
+            frame_bytes=self.frame_bytes,
+            has_main_loop=self.main_loop is not None,
+            lane_state=self.lane_state,
+        )
 
     def compute(self, value: Value, number: int) -> None:
-        """A value; the next value of something carried takes its place where nobody needs the old one any more."""
+        """Compute a value; store the next value of a carried scalar in its slot if the old one is no longer needed."""
         carried = self.carried.get(value)
         if carried is None:
             self.registers.put(value, self.instruction(value))
@@ -89,26 +145,26 @@ class VectorCode(ValueCode):
         (loop, index), place = carried, None
         mask, old = self.masks.get(loop), loop.carries[index]
         if mask is not None and value.op == "select" and value.args[2] is old:
-            # One choice for both: where the loop is over, nobody asks what else follows from the value.
-            name, mask = self.choice(value, self.both(mask, value.args[0])), None
+            # One select for both: where a lane has left the loop, nobody reads what else follows from the value.
+            name, mask = self.choice(value, self.conjoin(mask, value.args[0])), None
         else:
             name = self.instruction(value)
         if self.registers.schedule.last.get(old, -1) <= number:
             place = self.slots[loop][index]
             self.store_where(mask, name, place, value.kind)
-            self.homes.add(value)
+            self.in_slots.add(value)
         self.registers.put(value, name, place)
 
-    def both(self, mask: str, condition: Any) -> str:
-        """Where the mask and a condition hold; written once."""
+    def conjoin(self, mask: str, condition: Any) -> str:
+        """Return the mask of lanes where a mask and a condition hold; it is written once."""
         name = self.operand(condition, "b")
-        found = self.narrowed.get((mask, condition))
+        found = self.conjunctions.get((mask, condition))
         if found is None:
-            found = self.narrowed[mask, condition] = self.emit(f"and {self.types['b']} {mask}, {name}")
+            found = self.conjunctions[mask, condition] = self.emit(f"and {self.types['b']} {mask}, {name}")
         return found
 
     def enter_loop(self, loop: Loop, number: int) -> None:
-        """Carried values live in memory."""
+        """Begin a loop; carried scalars lie in memory."""
         slots = self.slots[loop] = [self.allocate(kind) for kind in loop.kinds]
         for slot, value, kind in zip(slots, loop.initial, loop.kinds, strict=True):
             self.store(kind, self.operand(value, kind), slot)
@@ -116,10 +172,10 @@ class VectorCode(ValueCode):
             if type(value) is Value and value.region is loop.body and not in_memory(value):
                 self.carried.setdefault(value, (loop, index))
         self.registers.flush(number)
-        if loop is self.main:
-            self.live = self.alive(number)
+        if loop is self.main_loop:
+            self.lane_state = self.collect_lane_state(number)
             self.do("ret void")
-            self.begin("i64 @rounds(ptr noalias %state, ptr noalias %frame, i64 %few)")
+            self.begin("i64 @rounds(ptr noalias %state, ptr noalias %frame, i64 %threshold)")
         before, head = self.block, self.label("head")
         self.labels[loop] = (head, self.label("body"), self.label("after"))
         self.do(f"br label %{head}")
@@ -132,11 +188,12 @@ class VectorCode(ValueCode):
                 self.registers.put(loop.counter, self.counters[loop][0])
 
     def leave_loop(self, loop: Loop, number: int) -> None:
-        """What has not found its place yet does, and round again."""
+        """End a round: store carried scalars that are not in their slots yet, and go round again."""
         moved = []
         for index, (value, kind) in enumerate(zip(loop.outputs, loop.kinds, strict=True)):
             slot = self.slots[loop][index]
-            if not (value in self.homes and self.registers.places[value] == slot) and value is not loop.carries[index]:
+            is_there = value in self.in_slots and self.registers.places[value] == slot
+            if not is_there and value is not loop.carries[index]:
                 moved.append((self.operand(value, kind), slot, kind))
         for name, slot, kind in moved:
             self.store_where(self.masks.get(loop), name, slot, kind)
@@ -151,12 +208,12 @@ class VectorCode(ValueCode):
             done = self.emit(f"icmp eq i64 {following}, {loop.rounds}")
             self.do(f"br i1 {done}, label %{after}, label %{head}")
         self.enter(after)
-        if loop is self.main:
+        if loop is self.main_loop:
             self.do(f"ret i64 {self.unfinished}")
             self.begin("void @after(ptr noalias %state, ptr noalias %frame)")
 
     def enter_guard(self, guard: Guard, number: int) -> None:
-        """Code that is jumped over where no lane needs it; its results are zero then."""
+        """Begin code that is jumped over where no lane needs it; its results are zero then."""
         slots = self.slots[guard] = [self.allocate(v.kind) for v in guard.results]
         for slot, value in zip(slots, guard.results, strict=True):
             self.store(value.kind, "zeroinitializer", slot)
@@ -166,7 +223,7 @@ class VectorCode(ValueCode):
         self.branch_if_more(mask, guard, "0")
 
     def leave_guard(self, guard: Guard, number: int) -> None:
-        """Its results go to their places."""
+        """End a guard: store its results in their slots."""
         for slot, value in zip(self.slots[guard], guard.outputs, strict=True):
             self.store(value.kind, self.operand(value, value.kind), slot)
         self.registers.flush(number)
@@ -174,7 +231,7 @@ class VectorCode(ValueCode):
         self.enter(self.labels[guard][2])
 
     def branch_if_more(self, mask: str, step: Loop | Guard, least: str) -> None:
-        """Into the step where the mask holds for more than so many lanes, else past it."""
+        """Branch into a step where the mask holds for more than `least` lanes, else past it."""
         bits = self.emit(f"bitcast {self.types['b']} {mask} to i{self.width}")
         self.unfinished = self.emit(f"zext i{self.width} {bits} to i64")
         number = self.unfinished
@@ -186,23 +243,23 @@ class VectorCode(ValueCode):
         self.do(f"br i1 {some}, label %{inside}, label %{after}")
         self.enter(inside)
 
-    def alive(self, number: int) -> dict[int, str]:
-        """What a lane has in the frame where the main loop begins, event `number`: kinds by offset."""
+    def collect_lane_state(self, number: int) -> dict[int, str]:
+        """Collect what is live of a lane where the main loop begins, at event `number`: see `Body.lane_state`."""
         found: dict[int, str] = {}
 
         def add(place: str, kind: str, entry: int = 0) -> None:
             found[self.offsets[place] + entry * self.stride(kind)] = kind
 
-        assert self.main is not None
-        for slot, kind in zip(self.slots[self.main], self.main.kinds, strict=True):
+        assert self.main_loop is not None
+        for slot, kind in zip(self.slots[self.main_loop], self.main_loop.kinds, strict=True):
             add(slot, kind)
         for event in self.registers.schedule.events[number + 1 :]:
             for value in event.uses:
                 if value.op == "own":
-                    argument, (entry, counter, _) = value.args
-                    entries = [entry] if counter is None else range(self.sizes[argument])
-                    for each in entries:
-                        add(self.own[argument], value.kind, each)
+                    at = value.address
+                    entries = [at.offset] if at.counter is None else range(self.sizes[at.buffer])
+                    for entry in entries:
+                        add(self.own[at.buffer], value.kind, entry)
                 elif value.op == "result":
                     step, index = value.args
                     if step in self.slots:
@@ -212,48 +269,48 @@ class VectorCode(ValueCode):
         return found
 
     def store(self, kind: str, name: str, place: str) -> None:
-        """Put a vector in memory."""
+        """Store a vector."""
         if kind == "b":
-            name = self.emit(f"sext {self.types['b']} {name} to {self.kept['b']}")
-        self.do(f"store {self.kept[kind]} {name}, ptr {self.pointer(place)}, align {self.stride(kind)}")
+            name = self.emit(f"sext {self.types['b']} {name} to {self.memory_types['b']}")
+        self.do(f"store {self.memory_types[kind]} {name}, ptr {self.pointer(place)}, align {self.stride(kind)}")
 
     def load(self, kind: str, place: str) -> str:
-        """Read a vector."""
-        name = self.emit(f"load {self.kept[kind]}, ptr {self.pointer(place)}, align {self.stride(kind)}")
-        return self.emit(f"icmp slt {self.kept['b']} {name}, zeroinitializer") if kind == "b" else name
+        """Load a vector."""
+        name = self.emit(f"load {self.memory_types[kind]}, ptr {self.pointer(place)}, align {self.stride(kind)}")
+        return self.emit(f"icmp slt {self.memory_types['b']} {name}, zeroinitializer") if kind == "b" else name
 
     def store_where(self, mask: str | None, new: str, slot: str, kind: str) -> None:
-        """Put a vector in memory, where the mask holds."""
+        """Store a vector in the lanes where the mask holds; None for all lanes."""
         vector = self.types[kind]
-        # A store by a mask would keep what is read soon after from being taken from it.
+        # After a masked store the processor could not forward what was stored to the loads that follow.
         if mask is not None:
             old = self.load(kind, slot)
             new = self.emit(f"select {self.types['b']} {mask}, {vector} {new}, {vector} {old}")
         self.store(kind, new, slot)
 
     def read(self, value: Value) -> str:
-        """A value that lies in memory."""
+        """Load a value that is not computed."""
         if value.op == "own":
-            return self.load_own(value.kind, *value.args)
+            return self.load_own(value.kind, value.address)
         if value.op == "shared":
-            return self.load_shared(value.kind, *value.args)
+            return self.load_shared(value.kind, value.address)
         step, index = value.args
         return self.load(value.kind, self.slots[step][index])
 
     # Memory
 
-    def place(self, index: tuple, unit: str, base: str) -> str:
-        """Address of an entry."""
-        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {self.offset(index)}")
+    def place(self, address: Address, unit: str, base: str) -> str:
+        """Write a pointer to an entry of the argument that begins at `base`."""
+        return self.emit(f"getelementptr {unit}, ptr {self.pointer(base)}, i64 {self.offset(address)}")
 
-    def load_own(self, kind: str, number: int, index: tuple) -> str:
-        """A different number for every lane."""
-        return self.load(kind, self.place(index, self.kept[kind], self.own[number]))
+    def load_own(self, kind: str, address: Address) -> str:
+        """Load a scalar of an argument that every lane has for itself."""
+        return self.load(kind, self.place(address, self.memory_types[kind], self.own[address.buffer]))
 
-    def load_shared(self, kind: str, number: int, index: tuple) -> str:
-        """The same number for all lanes."""
+    def load_shared(self, kind: str, address: Address) -> str:
+        """Load a scalar of an argument that all lanes share, and copy it to all lanes."""
         unit = {"f": self.scalar, "i": "i32", "b": "i8"}[kind]
-        one = self.emit(f"load {unit}, ptr {self.place(index, unit, self.shared[number])}")
+        one = self.emit(f"load {unit}, ptr {self.place(address, unit, self.shared[address.buffer])}")
         if kind == "b":
             one, unit = self.emit(f"icmp ne i8 {one}, 0"), "i1"
         vector = self.types[kind]

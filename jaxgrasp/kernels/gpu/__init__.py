@@ -1,1 +1,1 @@
-"""Kernels for GPUs: a thread for every lane."""
+"""The GPU target: kernels with one lane of the batch per thread."""

@@ -1,4 +1,4 @@
-"""NVIDIA's driver: kernels from PTX, on whichever devices they are launched."""
+"""Load kernels from PTX with NVIDIA's driver, for whichever devices they are launched on."""
 
 import ctypes
 import functools
@@ -6,17 +6,17 @@ from typing import Any
 
 from jaxgrasp.kernels.code.llvm import Unavailable
 
-# Kernels that belong to no context came with this version.
+# The version with which kernels came that belong to no context.
 _OLDEST = 12000
 _LOG_BYTES = 4096
-# Numbers of cuda.h: options of the assembler, and what a kernel is asked for.
+# Numbers of cuda.h: options of the assembler, and the attribute that a kernel is asked for.
 _ERROR_LOG, _ERROR_LOG_BYTES = 5, 6
 _NUM_REGS = 4
 
 
 @functools.cache
-def driver() -> Any:
-    """The driver's library.
+def load_driver() -> Any:
+    """Load the driver's library.
 
     Raises:
         Unavailable: there is none, or it is too old.
@@ -34,20 +34,20 @@ def driver() -> Any:
 
 
 def launch_address() -> int:
-    """Of `cuLaunchKernel`.
+    """Return the address of `cuLaunchKernel`.
 
     Raises:
         Unavailable: no driver.
     """
-    return ctypes.cast(driver().cuLaunchKernel, ctypes.c_void_p).value or 0
+    return ctypes.cast(load_driver().cuLaunchKernel, ctypes.c_void_p).value or 0
 
 
-# Where the driver writes, which may be whenever it assembles.
+# Buffers that the driver writes to, which may be whenever it assembles; they must stay alive.
 _written: list[Any] = []
 
 
-def kernel(ptx: bytes, name: str, devices: list[int]) -> int:
-    """The driver's handle of a kernel, which stays loaded.
+def load_kernel(ptx: bytes, name: str, devices: list[int]) -> int:
+    """Load a kernel for as long as the process lasts; return the driver's handle of it.
 
     Args:
         ptx: the code.
@@ -63,16 +63,16 @@ def kernel(ptx: bytes, name: str, devices: list[int]) -> int:
     options = (ctypes.c_int * 2)(_ERROR_LOG, _ERROR_LOG_BYTES)
     values = (ctypes.c_void_p * 2)(ctypes.addressof(log), _LOG_BYTES)
     _written.append((log, options, values))
-    code = driver().cuLibraryLoadData(
+    code = load_driver().cuLibraryLoadData(
         ctypes.byref(library), ctypes.c_char_p(ptx), options, values, ctypes.c_uint(2), None, None, ctypes.c_uint(0)
     )
     _check(code, "load", log.value.decode(errors="replace"))
     handle = ctypes.c_void_p()
-    _check(driver().cuLibraryGetKernel(ctypes.byref(handle), library, name.encode()), "find", "")
+    _check(load_driver().cuLibraryGetKernel(ctypes.byref(handle), library, name.encode()), "find", "")
     for number in devices:
         device, registers = ctypes.c_int(), ctypes.c_int()
-        _check(driver().cuDeviceGet(ctypes.byref(device), ctypes.c_int(number)), "find the device of", "")
-        code = driver().cuKernelGetAttribute(ctypes.byref(registers), _NUM_REGS, handle, device)
+        _check(load_driver().cuDeviceGet(ctypes.byref(device), ctypes.c_int(number)), "find the device of", "")
+        code = load_driver().cuKernelGetAttribute(ctypes.byref(registers), _NUM_REGS, handle, device)
         _check(code, "assemble", log.value.decode(errors="replace"))
     return handle.value or 0
 

@@ -1,4 +1,4 @@
-"""A program as code for NVIDIA's GPUs, one problem per thread.
+"""The GPU target: a program as code for NVIDIA's GPUs, one lane of the batch per thread.
 
 LLVM writes PTX, which is kept on disk; the driver's assembler makes a device's own code of it.
 """
@@ -9,19 +9,18 @@ from typing import NamedTuple
 
 import jax
 
-from jaxgrasp.kernels.code import llvm as machine
+from jaxgrasp.kernels.code import llvm
 from jaxgrasp.kernels.code.llvm import Unavailable
-from jaxgrasp.kernels.gpu import driver as cuda
-from jaxgrasp.kernels.gpu import handler as launcher
+from jaxgrasp.kernels.gpu import driver, handler
 from jaxgrasp.kernels.gpu.threads import ThreadCode
 from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
-from jaxgrasp.kernels.program.lowering import Program
-from jaxgrasp.kernels.program.schedule import scheduled
+from jaxgrasp.kernels.program.lowering import ScalarProgram
+from jaxgrasp.kernels.program.schedule import schedule
 
-# As XLA calls the devices.
-PLATFORM = "CUDA"
+# JAX's name of the devices.
+PLATFORM: str = "CUDA"
 TRIPLE = "nvptx64-nvidia-cuda"
-# Threads of a block: two warps, so that few problems are spread over many processors.
+# Threads of a block: two warps, so that a small batch is spread over many processors.
 THREADS = 64
 # Newer devices run code for this one, which all versions of LLVM here know.
 _NEWEST = 90
@@ -32,8 +31,8 @@ _MOST_POINTERS = 500
 class Devices(NamedTuple):
     """The GPUs of this process.
 
-    numbers: the driver's.
-    capability: of the oldest, as in sm_80.
+    numbers: the driver's numbers of the devices.
+    capability: compute capability of the oldest device, 80 for sm_80.
     description: everything that compiled code depends on.
     """
 
@@ -44,18 +43,18 @@ class Devices(NamedTuple):
 
 @functools.cache
 def devices() -> Devices:
-    """The GPUs at hand.
+    """Find the GPUs at hand.
 
     Raises:
-        Unavailable: none of NVIDIA's, no driver that can be used, or no llvmlite.
+        Unavailable: there are none of NVIDIA's, no driver that can be used, or no llvmlite.
     """
     try:
         found = jax.local_devices(backend="cuda")
         known = [int(device.compute_capability.replace(".", "")) for device in found]
     except (RuntimeError, AttributeError) as error:
         raise Unavailable(f"JAX knows no GPU of NVIDIA's: {error}") from None
-    cuda.driver()
-    version, capability = machine.machine().description.split()[0], min(_NEWEST, *known)
+    driver.load_driver()
+    version, capability = llvm.processor().description.split()[0], min(_NEWEST, *known)
     return Devices([d.local_hardware_id for d in found], capability, f"{version} {TRIPLE} sm_{capability}")
 
 
@@ -87,37 +86,36 @@ done:
 
 
 def description() -> str:
-    """Everything about the GPUs at hand that compiled code depends on.
+    """Describe everything about the GPUs at hand that compiled code depends on.
 
     Raises:
-        Unavailable: there are no fused kernels for them.
+        Unavailable: see `devices`.
     """
     return devices().description
 
 
-def module(program: Program, name: str) -> str:
-    """LLVM code of the kernel `name`: of pointers to arguments and results, all batch-first, and the number of rows.
+def write_module(program: ScalarProgram, name: str) -> str:
+    """Write LLVM code of a kernel of pointers to arguments and results, all batch-first, and the number of rows.
 
     Args:
         program: what to compute.
         name: of the kernel.
 
     Raises:
-        Unsupported: types or functions that are not known on GPUs, or too many arguments.
+        Unsupported: the program has types or functions that are not known on GPUs, or too many arguments.
     """
     for _, dtype in program.inputs + program.out_avals:
         if dtype.kind in "iu" and dtype.itemsize != 4:
             raise Unsupported(f"arguments or results of type {dtype}")
     if len(program.inputs) + len(program.outputs) > _MOST_POINTERS:
         raise Unsupported("too many arguments and results")
-    code = ThreadCode(program.builder.dtype)
-    code.block = "work"
+    code, own = ThreadCode(program), []
     for number, ((shape, dtype), shared) in enumerate(zip(program.inputs, program.shared, strict=True)):
         base = f"%argument{number}"
-        code.own.append(base if shared else _row(code, base, math.prod(shape), kind_of(dtype)))
+        own.append(base if shared else _row_pointer(code, base, math.prod(shape), kind_of(dtype)))
     places, results = [], []
     for number, (out, (_, dtype)) in enumerate(zip(program.outputs, program.out_avals, strict=True)):
-        start = _row(code, f"%result{number}", out.size, kind_of(dtype))
+        start = _row_pointer(code, f"%result{number}", out.size, kind_of(dtype))
         places += [(start, entry, kind_of(dtype)) for entry in range(out.size)]
         results += list(out.flat)
 
@@ -126,10 +124,10 @@ def module(program: Program, name: str) -> str:
         if type(value) is not Value:
             name = code.constant(value, kind)
         name = code.emit(f"zext i1 {name} to i8") if kind == "b" else name
-        place = code.place((entry, None, 0), _unit(code, kind), start)
+        place = code.emit(f"getelementptr {_unit(code, kind)}, ptr addrspace(1) {start}, i64 {entry}")
         code.do(f"store {_unit(code, kind)} {name}, ptr addrspace(1) {place}")
 
-    code.write(scheduled(program), store)
+    code.write(schedule(program), own, store)
     parameters = [f"ptr addrspace(1) noalias readonly %argument{i}" for i in range(len(program.inputs))]
     parameters += [f"ptr addrspace(1) noalias %result{i}" for i in range(len(program.outputs))]
     text = _KERNEL.replace("@NAME@", f"@{name}").replace("@PARAMETERS@", ", ".join(parameters))
@@ -141,44 +139,44 @@ def _unit(code: ThreadCode, kind: str) -> str:
     return "i8" if kind == "b" else code.types[kind]
 
 
-def _row(code: ThreadCode, base: str, count: int, kind: str) -> str:
-    """Where this thread's row begins."""
+def _row_pointer(code: ThreadCode, base: str, count: int, kind: str) -> str:
+    """Write the pointer to this thread's row."""
     before = code.emit(f"mul i64 %row, {count}")
     return code.emit(f"getelementptr {_unit(code, kind)}, ptr addrspace(1) {base}, i64 {before}")
 
 
-def ptx(code: str, capability: int) -> str:
-    """PTX of a module.
+def write_ptx(code: str, capability: int) -> str:
+    """Compile a module to PTX.
 
     Args:
         code: LLVM code.
-        capability: of the oldest device that shall run it, as in sm_80.
+        capability: compute capability of the oldest device that shall run it, 80 for sm_80.
 
     Raises:
         RuntimeError: LLVM does not accept it, or was built without GPUs.
     """
-    import llvmlite.binding as llvm
+    from llvmlite import binding
 
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    target = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=f"sm_{capability}", opt=2)
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    target = binding.Target.from_triple(TRIPLE).create_target_machine(cpu=f"sm_{capability}", opt=2)
     # LLVM's own order takes a sixth more of a thread's memory in float64.
-    with machine.in_given_order():
-        return target.emit_assembly(llvm.parse_assembly(code))
+    with llvm.in_given_order():
+        return target.emit_assembly(binding.parse_assembly(code))
 
 
-def compiled(program: Program, name: str) -> bytes:
-    """PTX of a program for all devices at hand, one kernel `name`.
+def compile_program(program: ScalarProgram, name: str) -> bytes:
+    """Compile a program to PTX for all devices at hand, with one kernel `name`.
 
     Raises:
-        Unsupported: something in it is not known on GPUs.
+        Unsupported: see `write_module`.
         RuntimeError: LLVM does not accept it.
     """
-    return ptx(module(program, name), devices().capability).encode()
+    return write_ptx(write_module(program, name), devices().capability).encode()
 
 
-def handler(code: bytes, name: str) -> int:
-    """Address of the function by which XLA launches a kernel.
+def load_handler(code: bytes, name: str) -> int:
+    """Load a kernel; return the address of the function by which XLA launches it.
 
     Args:
         code: PTX.
@@ -187,6 +185,6 @@ def handler(code: bytes, name: str) -> int:
     Raises:
         RuntimeError: the driver does not accept it.
     """
-    kernel = cuda.kernel(code, name, devices().numbers)
-    text = launcher.module(name, kernel=kernel, launch=cuda.launch_address(), threads=THREADS)
-    return machine.loaded(machine.compiled(text), name)
+    kernel = driver.load_kernel(code, name, devices().numbers)
+    text = handler.write_module(name, kernel=kernel, launch=driver.launch_address(), threads=THREADS)
+    return llvm.load(llvm.compile_module(text), name)

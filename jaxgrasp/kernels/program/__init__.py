@@ -1,1 +1,1 @@
-"""From a jaxpr to scalar operations in the order in which they are computed."""
+"""The middle of the compiler: from a jaxpr to scalar operations in the order in which they are computed."""

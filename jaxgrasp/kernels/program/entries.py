@@ -1,4 +1,4 @@
-"""Arrays whose entries are scalars of a kernel: `Value`s or NumPy's constants."""
+"""Arrays whose entries are scalars of a kernel, each a `Value` or a NumPy constant."""
 
 from typing import Any
 
@@ -10,44 +10,44 @@ from jaxgrasp.kernels.program.expressions import Value, kind_of
 
 
 def array(entries: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """An array of these entries."""
+    """Make an array of these entries."""
     out = np.empty(len(entries), object)
     out[:] = entries
     return out.reshape(shape)
 
 
 def objects(x: np.ndarray) -> np.ndarray:
-    """As an array of scalars; constants are NumPy's."""
+    """Turn an array into one of dtype object, whose entries are scalars of a kernel."""
     return x if x.dtype == object else array(list(x.ravel()), x.shape)
 
 
-def known(x: np.ndarray, dtype: Any) -> np.ndarray:
-    """A typed array where all entries are constants."""
+def fold_constants(x: np.ndarray, dtype: Any) -> np.ndarray:
+    """Turn an array whose entries are all constants into one of this dtype; return others as they are."""
     if x.dtype != object or any(type(v) is Value for v in x.flat):
         return x
     return np.array(list(x.flat), dtype).reshape(x.shape)
 
 
 def kind_of_scalar(v: Any) -> str:
-    """The type of one scalar."""
+    """Return the type of one scalar."""
     return v.kind if type(v) is Value else kind_of(v.dtype)
 
 
 def aval_of(variable: Any) -> ShapedArray:
-    """Shape and type of a variable, or of a constant in its place: kernels are of arrays, and have no other variables.
+    """Return shape and dtype of a variable of a jaxpr, or of a constant in its place.
 
-    JAX declares no more than that there is an abstract value.
+    The variables of kernels are arrays; JAX declares no more than that there is an abstract value.
     """
     return variable.aval
 
 
 def like(aval: Any, dtype: Any) -> Any:
-    """Shape and type of a result of another type."""
+    """Return the same shape with another dtype."""
     return jax.ShapeDtypeStruct(aval.shape, dtype)
 
 
-def kinds_of(x: np.ndarray) -> str:
-    """The type of all entries; integers differ between problems as soon as one does."""
+def common_kind(x: np.ndarray) -> str:
+    """Return the type of all entries; it is "i" if some integers are "u", shared by all lanes, and others are not."""
     if x.dtype != object:
         return kind_of(x.dtype)
     kinds = {kind_of_scalar(v) for v in x.flat}

@@ -1,25 +1,44 @@
-"""Scalar expressions: what a fused kernel computes, one problem at a time.
+"""The intermediate representation: scalar expressions, which a kernel computes for one lane of the batch.
 
 A `Value` is one operation on other values or constants. Equal operations are the same value, operations on constants
 are done at once, and a value belongs to the outermost region (a loop's body, say) that knows its operands: what does
 not change in a loop is computed before it.
+
+Operations and their `args`; an operand is a `Value` or a NumPy scalar, and the type is that of the result:
+
+- "own", "shared" (Address): a scalar of an argument that every lane has for itself, or that all lanes share.
+- "carry" (Loop, index): a scalar that a loop carries, at the beginning of a round.
+- "result" (Loop or Guard, index): a scalar that a loop or a guard leaves.
+- "counter" (): the number of the round of the loop in whose body it is, type "u".
+- "add", "sub", "mul", "max", "min" (a, b) and "neg" (a): types "f", "i" and "u".
+- "div" (a, b), "abs", "sqrt", "rsqrt" (1 / sqrt), "exp", "log", "floor" (a): type "f". `make` leaves 1 as the only
+  dividend.
+- "eq", "ne", "lt", "le", "gt", "ge" (a, b) and "is_finite" (a): type "b".
+- "and", "or", "xor" (a, b) and "not" (a): type "b".
+- "select" (condition, a, b): a where the condition holds, else b; the type of a and b.
+- "convert" (a): a number as an integer or an integer as a number, "f" or "i".
+
+The first five are read where they lie, the others are computed.
 """
 
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 
 class Region:
-    """Code that runs as a whole: a kernel, the body of a loop, or what only some problems need.
+    """Code that runs as a whole: a kernel, the body of a loop, or of a guard.
 
-    steps: what it does beside computing values (loops, stores), in order.
-    guarded: values stay inside even where they could be computed outside.
+    parent: the region around it; None for the kernel's own.
+    depth: how many regions are around it.
+    steps: the loops and guards in it, in order.
+    guarded: whether values stay inside even where they could be computed outside.
+    known: its values by operation and operands.
     """
 
     def __init__(self, parent: "Region | None", guarded: bool = False) -> None:
-        """A region inside another one."""
+        """Make an empty region inside another one."""
         self.parent, self.guarded = parent, guarded
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.steps: list[Any] = []
@@ -27,25 +46,50 @@ class Region:
 
     @property
     def outer(self) -> "Region":
-        """The region around it, which all have but the kernel's own."""
+        """The region around it; the kernel's own has none."""
         assert self.parent is not None
         return self.parent
 
 
+class Address(NamedTuple):
+    """The place of a scalar of an argument: entry `offset + counter * stride` of a row of the argument.
+
+    buffer: number of the argument.
+    offset: number of the entry in the flattened row, where there is no counter or it is zero.
+    counter: a loop's counter, or a value of type "u" computed from one; None where the entry is always the same.
+    stride: how many entries further one more of the counter is.
+    """
+
+    buffer: int
+    offset: int
+    counter: "Value | None" = None
+    stride: int = 0
+
+
 @final
 class Value:
-    """A scalar that is computed: an operation, its operands, its type and its region.
+    """A scalar that is computed, compared by identity.
 
-    Types: "f" a number, "i" an integer and "b" a truth value of every problem; "u" an integer that all problems share.
+    op: its operation, see the module.
+    args: the operands; what they are depends on the operation.
+    kind: its type: "f" a number, "i" an integer, "b" a truth value, all of them different in every lane; "u" an integer
+        that all lanes share.
+    region: the region that computes it.
+    serial: how many values were made before it, in this process.
     """
 
     __slots__ = ("args", "kind", "op", "region", "serial")
     count = 0
 
     def __init__(self, op: str, args: tuple, kind: str, region: Region) -> None:
-        """A new value."""
+        """Make a value; `Builder.value` does so only where there is none like it."""
         self.op, self.args, self.kind, self.region = op, args, kind, region
         self.serial = Value.count = Value.count + 1
+
+    @property
+    def address(self) -> Address:
+        """The place of the scalar; only "own" and "shared" have an address."""
+        return self.args[0]
 
 
 _COMMUTE = {"add", "mul", "max", "min", "and", "or", "eq", "ne"}
@@ -78,11 +122,11 @@ _FOLD: dict[str, Callable[..., Any]] = {
 
 
 class Unsupported(Exception):
-    """Something that fused kernels cannot do."""
+    """A kernel cannot be made of the program; the message names the part of it that stands in the way."""
 
 
 def kind_of(dtype: Any) -> str:
-    """The type of a scalar of this dtype."""
+    """Return the type of a scalar of this dtype."""
     kinds = {"f": "f", "i": "i", "b": "b", "u": "i"}
     if np.dtype(dtype).kind not in kinds:
         raise Unsupported(f"values of type {dtype}")
@@ -90,19 +134,23 @@ def kind_of(dtype: Any) -> str:
 
 
 class Builder:
-    """Makes values, in the region that is current."""
+    """Makes values.
+
+    dtype: of numbers.
+    region: the region that is being written.
+    """
 
     def __init__(self, dtype: Any) -> None:
-        """For numbers of this type."""
+        """Begin a kernel with numbers of this dtype."""
         self.dtype = np.dtype(dtype)
         self.region = Region(None)
 
     def make(self, op: str, *args: Any) -> Any:
-        """The value of an operation, or the constant where that is known."""
+        """Return the value of an operation, in its cheapest form, or the constant where that is known."""
         if not any(type(x) is Value for x in args):
             with np.errstate(all="ignore"):
                 return self._constant(op, args)
-        simple = self._simplified(op, args)
+        simple = _SIMPLIFY[op](self, *args) if op in _SIMPLIFY else None
         if simple is not None:
             return simple
         if op in _COMMUTE and _order(args[0]) > _order(args[1]):
@@ -113,13 +161,15 @@ class Builder:
                 return np.bool_(False)
             kind = "b"
         elif op == "select":
-            kind = next(_kind(x) for x in args[1:])
+            # The condition differs between lanes, and so does what it picks of integers that do not.
+            kind = _kind(args[1]).replace("u", "i")
         else:
-            kind = next(_kind(x) for x in args if type(x) is Value)
+            kinds = [x.kind for x in args if type(x) is Value]
+            kind = "i" if "i" in kinds else kinds[0]
         return self.value(op, args, kind)
 
     def value(self, op: str, args: tuple, kind: str) -> Value:
-        """A value that is not simplified."""
+        """Return the value of an operation as it is, new or known."""
         key = (op, kind, *[id(x) if type(x) is Value else _bits(x) for x in args])
         home = self._home(args)
         region: Region | None = self.region
@@ -132,10 +182,11 @@ class Builder:
         return found
 
     def _home(self, args: tuple) -> Region:
+        """Find the outermost region that knows all operands."""
         home, region = None, self.region
-        # Addresses in memory may depend on a counter.
-        index = args[1] if len(args) == 2 and isinstance(args[1], tuple) else ()
-        for x in (*args, *index):
+        for x in args:
+            # An address may depend on a counter, and then belongs to its loop.
+            x = x.counter if isinstance(x, Address) else x
             if type(x) is Value and (home is None or x.region.depth > home.depth):
                 home = x.region
         # The outermost region is the kernel's; guarded ones keep what is made in them.
@@ -152,79 +203,128 @@ class Builder:
             return (1 / np.sqrt(args[0])).astype(args[0].dtype)
         return _FOLD[op](*args)
 
-    def _simplified(self, op: str, args: tuple[Any, ...]) -> Any:
-        """Cheaper forms; a product with zero is zero, whatever the other factor."""
-        if op in ("add", "sub", "mul", "div"):
-            a, b = args
-            left, right = type(a) is not Value, type(b) is not Value
-            if op == "mul":
-                for x, y, known in ((a, b, left), (b, a, right)):
-                    if not known:
-                        continue
-                    number: np.generic = x
-                    if number in (0, 1, -1):
-                        zero = number.dtype.type(0)
-                        return x * zero if number == 0 else y if number == 1 else self.make("neg", y)
-                # Signs go outwards, where a sum takes them up.
-                for x, y in ((a, b), (b, a)):
-                    if type(x) is Value and x.op == "neg":
-                        return self.make("neg", self.make("mul", x.args[0], y))
-                    if type(x) is not Value and x < 0:
-                        return self.make("neg", self.make("mul", -x, y))
-                    if type(x) is not Value and y.kind == "f" and y.op == "mul" and type(y.args[0]) is not Value:
-                        both = x * y.args[0]
-                        if np.isfinite(both) and abs(both) >= np.finfo(both.dtype).tiny:
-                            return self.make("mul", both, y.args[1])
-            elif op == "add":
-                if left and a == 0:
-                    return b
-                if right and b == 0:
-                    return a
-                if not right and b.op == "neg":
-                    return self.make("sub", a, b.args[0])
-                if not left and a.op == "neg":
-                    return self.make("sub", b, a.args[0])
-            elif op == "sub":
-                if right and b == 0:
-                    return a
-                if left and a == 0:
-                    return self.make("neg", b)
-                if not right and b.op == "neg":
-                    return self.make("add", a, b.args[0])
-                if not left and a.op == "neg":
-                    return self.make("neg", self.make("add", a.args[0], b))
-            elif right and b != 0 and np.isfinite(b):
-                return self.make("mul", a, (1 / b).astype(b.dtype))
-            elif not (left and a == 1):
-                # The reciprocal may be had already, or before a loop.
-                return self.make("mul", a, self.make("div", self.dtype.type(1), b))
-        elif op == "neg" and args[0].op == "neg":
-            return args[0].args[0]
-        elif op == "neg" and args[0].op == "sub":
-            return self.make("sub", args[0].args[1], args[0].args[0])
-        elif op == "not" and args[0].op == "not":
-            return args[0].args[0]
-        elif op in ("and", "or"):
-            for x, y in (args, args[::-1]):
-                if type(x) is not Value:
-                    return (y if x else x) if op == "and" else (x if x else y)
-            if args[0] is args[1]:
-                return args[0]
-        elif op == "select":
-            if type(args[0]) is not Value:
-                return args[1] if args[0] else args[2]
-            if args[1] is args[2]:
-                return args[1]
-            inner = args[1]
-            if type(inner) is Value and inner.op == "select" and inner.args[2] is args[2]:
-                return self.make("select", self.make("and", args[0], inner.args[0]), inner.args[1], args[2])
-        elif op in ("max", "min"):
-            if args[0] is args[1]:
-                return args[0]
-            if all(type(x) is Value and x.op == "neg" for x in args):
-                other = "min" if op == "max" else "max"
-                return self.make("neg", self.make(other, args[0].args[0], args[1].args[0]))
+
+def _simplify_product(builder: Builder, a: Any, b: Any) -> Any:
+    for x, y in ((a, b), (b, a)):
+        if type(x) is Value:
+            continue
+        constant: np.generic = x
+        if constant == 0:
+            # Zero times anything is zero, infinity and NaN included.
+            return x * constant.dtype.type(0)
+        if constant == 1:
+            return y
+        if constant == -1:
+            return builder.make("neg", y)
+    for x, y in ((a, b), (b, a)):
+        # Signs go outwards, where a sum takes them up.
+        if type(x) is Value and x.op == "neg":
+            return builder.make("neg", builder.make("mul", x.args[0], y))
+        if type(x) is not Value and x < 0:
+            return builder.make("neg", builder.make("mul", -x, y))
+        if type(x) is not Value and y.kind == "f" and y.op == "mul" and type(y.args[0]) is not Value:
+            both = x * y.args[0]
+            if np.isfinite(both) and abs(both) >= np.finfo(both.dtype).tiny:
+                return builder.make("mul", both, y.args[1])
+    return None
+
+
+def _simplify_sum(builder: Builder, a: Any, b: Any) -> Any:
+    if _is(a, 0):
+        return b
+    if _is(b, 0):
+        return a
+    if _does(b, "neg"):
+        return builder.make("sub", a, b.args[0])
+    if _does(a, "neg"):
+        return builder.make("sub", b, a.args[0])
+    return None
+
+
+def _simplify_difference(builder: Builder, a: Any, b: Any) -> Any:
+    if _is(b, 0):
+        return a
+    if _is(a, 0):
+        return builder.make("neg", b)
+    if _does(b, "neg"):
+        return builder.make("add", a, b.args[0])
+    if _does(a, "neg"):
+        return builder.make("neg", builder.make("add", a.args[0], b))
+    return None
+
+
+def _simplify_quotient(builder: Builder, a: Any, b: Any) -> Any:
+    if type(b) is not Value and b != 0 and np.isfinite(b):
+        return builder.make("mul", a, (1 / b).astype(b.dtype))
+    if not _is(a, 1):
+        # The reciprocal may exist already, or be computed before a loop.
+        return builder.make("mul", a, builder.make("div", builder.dtype.type(1), b))
+    return None
+
+
+def _simplify_negation(builder: Builder, x: Value) -> Any:
+    if x.op == "neg":
+        return x.args[0]
+    if x.op == "sub":
+        return builder.make("sub", x.args[1], x.args[0])
+    return None
+
+
+def _simplify_logic(op: str) -> Callable[..., Any]:
+    def simplify(builder: Builder, a: Any, b: Any) -> Any:
+        for x, y in ((a, b), (b, a)):
+            if type(x) is not Value:
+                return (y if x else x) if op == "and" else (x if x else y)
+        return a if a is b else None
+
+    return simplify
+
+
+def _simplify_select(builder: Builder, condition: Any, a: Any, b: Any) -> Any:
+    if type(condition) is not Value:
+        return a if condition else b
+    if a is b:
+        return a
+    if _does(a, "select") and a.args[2] is b:
+        return builder.make("select", builder.make("and", condition, a.args[0]), a.args[1], b)
+    return None
+
+
+def _simplify_extremum(opposite: str) -> Callable[..., Any]:
+    def simplify(builder: Builder, a: Any, b: Any) -> Any:
+        if a is b:
+            return a
+        if _does(a, "neg") and _does(b, "neg"):
+            return builder.make("neg", builder.make(opposite, a.args[0], b.args[0]))
         return None
+
+    return simplify
+
+
+# Cheaper forms of operations of which at least one operand is not a constant; each returns None where it knows none.
+_SIMPLIFY: dict[str, Callable[..., Any]] = {
+    "mul": _simplify_product,
+    "add": _simplify_sum,
+    "sub": _simplify_difference,
+    "div": _simplify_quotient,
+    "neg": _simplify_negation,
+    "not": lambda builder, x: x.args[0] if x.op == "not" else None,
+    "and": _simplify_logic("and"),
+    "or": _simplify_logic("or"),
+    "select": _simplify_select,
+    "max": _simplify_extremum("min"),
+    "min": _simplify_extremum("max"),
+}
+
+
+def _is(x: Any, number: int) -> bool:
+    """Tell whether a scalar is this constant."""
+    return type(x) is not Value and bool(x == number)
+
+
+def _does(x: Any, op: str) -> bool:
+    """Tell whether a scalar is computed by this operation."""
+    return type(x) is Value and x.op == op
 
 
 def _kind(x: Any) -> str:

@@ -1,34 +1,43 @@
-"""From a jaxpr to scalar expressions: every small axis is spelt out, loops stay loops.
+"""Lower a jaxpr to scalar expressions: arrays are unrolled to their entries, loops stay loops.
 
-A jaxpr over arrays of small static shapes is evaluated with arrays whose entries are `Value`s. What only moves entries
-about (slices, transposes, gathers with known indices) costs nothing in the kernel.
+A jaxpr over arrays of small static shapes is evaluated with arrays whose entries are `Value`s. Operations that only
+move entries (slices, transposes, gathers with known indices) cost nothing in the kernel.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
 
-from jaxgrasp.kernels.program.entries import array, aval_of, kinds_of, known, objects
-from jaxgrasp.kernels.program.expressions import Builder, Region, Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.entries import array, aval_of, common_kind, fold_constants, objects
+from jaxgrasp.kernels.program.expressions import Address, Builder, Region, Unsupported, Value, kind_of
 from jaxgrasp.kernels.program.rules import ELEMENTWISE, RULES
 
-# Loops of at most so many rounds are spelt out: always, as the first round often starts from zeros and the last one
-# leaves what nobody asks for; where a round depends on its number; and where each leaves a result.
-_SHORT, _SPELT_OUT, _STACKED = 2, 16, 64
-# Entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
+# Unroll limits, in rounds: of any loop, since the first round often starts from zeros and nobody reads all that the
+# last one leaves; of loops whose body reads the counter; of loops that stack results.
+_SHORT, _COUNTED, _STACKED = 2, 16, 64
+# The type of the operands of operations that have instructions for one type alone.
+_ONLY = {"div": "f", "abs": "f", "and": "b", "or": "b", "xor": "b", "not": "b"}
+# The most entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
 _MOST_ENTRIES = 400_000
 
 
 @dataclass(eq=False)
 class Loop:
-    """A loop in a kernel's code.
+    """A loop in a kernel's code; it is a step of the region around it.
 
-    body: its region; `outputs` are the next values of `carries`, which start at `initial`.
-    rounds: how many; None for as long as any problem's `condition` holds. Others' values then stay.
+    body: the region of one round.
+    initial: for every carried scalar, its value before the first round.
+    carries: the carried scalars at the beginning of a round, values of `body`.
+    kinds: the types of the carried scalars.
+    rounds: how many rounds there are; None for as long as the `condition` of any lane holds. The carried scalars of
+        lanes whose condition does not hold stay as they are.
+    condition: a scalar of `body` that depends on `carries`; None where `rounds` is known.
+    counter: the number of the round, a value of type "u" in `body`; None where `rounds` is.
+    outputs: the carried scalars at the end of a round.
+    results: the carried scalars after the last round, values of the region around the loop.
     """
 
     body: Region
@@ -44,7 +53,13 @@ class Loop:
 
 @dataclass(eq=False)
 class Guard:
-    """Code that runs where any problem's `condition` holds; its `outputs` are else zero."""
+    """Code that runs if the `condition` of any lane holds; it is a step of the region around it.
+
+    body: the region of the code.
+    condition: a scalar of the region around the guard.
+    outputs: the scalars of `body` that are used after the guard.
+    results: these scalars after the guard, values of the region around it; they are zero where the code did not run.
+    """
 
     body: Region
     condition: Any
@@ -53,11 +68,14 @@ class Guard:
 
 
 @dataclass
-class Program:
-    """A kernel: what it reads, what it computes, what it leaves.
+class ScalarProgram:
+    """A kernel as scalar operations on one lane.
 
-    shapes: of the inputs, dtypes with them; `shared` tells which all problems share.
-    outputs: arrays of scalars.
+    builder: made all values; its region is the outermost one, whose steps are the kernel's loops and guards.
+    inputs: shape and dtype of every argument.
+    shared: for every argument, whether all lanes share it.
+    outputs: arrays of scalars, the results.
+    out_avals: shape and dtype of every result.
     """
 
     builder: Builder
@@ -67,15 +85,15 @@ class Program:
     out_avals: list[tuple[tuple[int, ...], np.dtype]]
 
 
-def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
-    """The program of one problem.
+def lower(jaxpr: ClosedJaxpr, shared: list[bool]) -> ScalarProgram:
+    """Lower a function of one lane to scalar operations.
 
     Args:
-        jaxpr: of a function of arrays with one trailing axis of size 1 in place of the problems.
-        shared: for every argument, whether all problems share it.
+        jaxpr: of a function of arrays with one trailing axis of size 1 in place of the lanes.
+        shared: for every argument, whether all lanes share it.
 
     Raises:
-        Unsupported: what fused kernels cannot do.
+        Unsupported: the function has no floating types or several, too many operations, or one without a rule.
     """
     floats = {np.dtype(aval_of(v).dtype) for v in jaxpr.jaxpr.outvars if kind_of(aval_of(v).dtype) == "f"}
     floats |= {np.dtype(aval_of(v).dtype) for v in jaxpr.jaxpr.invars if kind_of(aval_of(v).dtype) == "f"}
@@ -89,18 +107,18 @@ def lowered(jaxpr: ClosedJaxpr, shared: list[bool]) -> Program:
         aval = aval_of(var)
         kind = kind_of(aval.dtype)
         loads = [
-            lowering.builder.value("shared" if is_shared else "own", (number, (i, None, 0)), kind)
+            lowering.builder.value("shared" if is_shared else "own", (Address(number, i),), kind)
             for i in range(math.prod(aval.shape))
         ]
         inputs.append(array(loads, aval.shape))
     consts = [np.asarray(c) for c in jaxpr.consts]
     outputs = lowering.run(jaxpr.jaxpr, consts, inputs)
     avals = lambda vs: [(tuple(aval_of(v).shape), np.dtype(aval_of(v).dtype)) for v in vs]
-    return Program(lowering.builder, avals(jaxpr.jaxpr.invars), shared, outputs, avals(jaxpr.jaxpr.outvars))
+    return ScalarProgram(lowering.builder, avals(jaxpr.jaxpr.invars), shared, outputs, avals(jaxpr.jaxpr.outvars))
 
 
 def _entries(jaxpr: Jaxpr) -> int:
-    """Of all arrays that are computed, in loops once for each round that may be spelt out."""
+    """Count the entries of all arrays that are computed, in a loop once for each round that may be unrolled."""
     total = 0
     for eqn in jaxpr.eqns:
         total += sum(math.prod(aval_of(v).shape) for v in eqn.outvars)
@@ -111,11 +129,13 @@ def _entries(jaxpr: Jaxpr) -> int:
 
 
 class _Lowering:
+    """Evaluates jaxprs with arrays of scalars; rules use its methods."""
+
     def __init__(self, builder: Builder) -> None:
         self.builder = builder
 
     def run(self, jaxpr: Jaxpr, consts: list[np.ndarray], args: list[np.ndarray]) -> list[np.ndarray]:
-        """Evaluate."""
+        """Evaluate a jaxpr; return its results."""
         bound = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(zip(jaxpr.invars, args, strict=True))
 
         def read(v: Any) -> np.ndarray:
@@ -129,7 +149,7 @@ class _Lowering:
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, eqn: Any, args: list[np.ndarray]) -> list[np.ndarray]:
-        """The results of one equation."""
+        """Evaluate one equation; return its results."""
         name, params = eqn.primitive.name, eqn.params
         if name in _CALLS:
             inner = params[_CALLS[name]]
@@ -149,40 +169,33 @@ class _Lowering:
         return out if isinstance(out, list) else [np.asarray(out)]
 
     def elementwise(self, op: str, args: list[np.ndarray], aval: Any) -> np.ndarray:
-        """An operation entry by entry."""
-        if op == "div" and kind_of(aval.dtype) != "f":
-            raise Unsupported("division of integers")
+        """Apply an operation entry by entry."""
+        if kind_of(aval.dtype) != _ONLY.get(op, kind_of(aval.dtype)):
+            raise Unsupported(f"the operation {op} on values of type {aval.dtype}")
         make, shape = self.builder.make, tuple(aval.shape)
         flat = [objects(np.broadcast_to(x, shape) if x.shape != shape else x).ravel() for x in args]
         out = array([make(op, *entries) for entries in zip(*flat, strict=True)], shape)
-        return known(out, aval.dtype)
+        return fold_constants(out, aval.dtype)
 
     def fold(self, op: str, entries: list[Any]) -> Any:
-        """Combine scalars in pairs."""
+        """Combine scalars by an operation, in pairs."""
         while len(entries) > 1:
             pairs = [entries[i : i + 2] for i in range(0, len(entries), 2)]
             entries = [self.builder.make(op, *pair) if len(pair) == 2 else pair[0] for pair in pairs]
         return entries[0]
 
     def scan(self, params: dict, args: list[np.ndarray]) -> list[np.ndarray]:
-        """A loop of known length: spelt out where it is short and a round depends on its number."""
+        """Lower a loop of known length; unroll it where it is short."""
         body, length, reverse = params["jaxpr"], params["length"], params["reverse"]
         n_consts, n_carry = params["num_consts"], params["num_carry"]
         consts, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
         inner = [np.asarray(c) for c in body.consts]
         n_ys = len(body.jaxpr.outvars) - n_carry
+        # Integers that only count rounds are not carried: they are the loop's counter and where they start.
         counters = _counters(body.jaxpr, n_consts, n_carry, carry)
-        numbered = xs or any(used for _, used in counters.values())
-        if length <= _SHORT or (numbered and length <= _SPELT_OUT) or (n_ys and length <= _STACKED):
-            rows: list[list[np.ndarray]] = [[] for _ in range(n_ys)]
-            for i in range(length):
-                at = length - 1 - i if reverse else i
-                out = self.run(body.jaxpr, inner, [*consts, *carry, *[x[at] for x in xs]])
-                carry = out[:n_carry]
-                for row, y in zip(rows, out[n_carry:], strict=True):
-                    row.append(y)
-            ys = [self.stack(row[::-1] if reverse else row) for row in rows]
-            return [*carry, *ys]
+        counted = xs or any(used for _, used in counters.values())
+        if length <= _SHORT or (counted and length <= _COUNTED) or (n_ys and length <= _STACKED):
+            return self.unroll(params, consts, carry, xs)
         if n_ys or reverse:
             raise Unsupported("a long loop with stacked results")
         region = Region(self.builder.region)
@@ -191,11 +204,11 @@ class _Lowering:
         inits = [x for i, x in enumerate(carry) if i not in counters]
         loop, values = self.open_loop(region, inits, length)
         loop.counter = counter
-        given = iter(values)
+        carried = iter(values)
         start = [
             array([self.builder.make("add", counter, v) for v in base[i].ravel()], base[i].shape)
             if i in counters
-            else next(given)
+            else next(carried)
             for i in range(n_carry)
         ]
         rows_now = [self.entry(x, counter) for x in xs]
@@ -204,17 +217,33 @@ class _Lowering:
         last = lambda i: np.asarray(base[i] + length, base[i].dtype)
         return [last(i) if i in counters else next(results) for i in range(n_carry)]
 
+    def unroll(
+        self, params: dict, consts: list[np.ndarray], carry: list[np.ndarray], xs: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Evaluate a scan's rounds one after the other."""
+        body, length, reverse = params["jaxpr"], params["length"], params["reverse"]
+        inner = [np.asarray(c) for c in body.consts]
+        rows: list[list[np.ndarray]] = [[] for _ in range(len(body.jaxpr.outvars) - len(carry))]
+        for i in range(length):
+            at = length - 1 - i if reverse else i
+            out = self.run(body.jaxpr, inner, [*consts, *carry, *[x[at] for x in xs]])
+            carry = out[: len(carry)]
+            for row, y in zip(rows, out[len(carry) :], strict=True):
+                row.append(y)
+        return [*carry, *[self.stack(row[::-1] if reverse else row) for row in rows]]
+
     def stack(self, rows: list[np.ndarray]) -> np.ndarray:
+        """Stack arrays along a new leading axis."""
         if all(r.dtype != object for r in rows):
             return np.stack(rows)
         return np.stack([objects(r) for r in rows])
 
     def open_loop(self, region: Region, inits: list[np.ndarray], rounds: int | None) -> tuple[Loop, list[np.ndarray]]:
-        """A loop whose carried arrays start at `inits`; the arrays inside."""
+        """Begin a loop whose carried arrays start at `inits`; return it and the carried arrays inside."""
         loop = Loop(region, [], [], [], rounds)
         values = []
         for x in inits:
-            kind = kind_of(x.dtype) if x.dtype != object else kinds_of(x)
+            kind = kind_of(x.dtype) if x.dtype != object else common_kind(x)
             inside = []
             for entry in objects(x).ravel():
                 inside.append(Value("carry", (loop, len(loop.carries)), kind, region))
@@ -226,7 +255,7 @@ class _Lowering:
         return loop, values
 
     def close_loop(self, loop: Loop, outputs: list[np.ndarray], like: list[np.ndarray]) -> list[np.ndarray]:
-        """The loop is written; what it leaves."""
+        """End a loop; return the carried arrays after it."""
         loop.outputs = [v for x in outputs for v in objects(x).ravel()]
         region = self.builder.region = loop.body.outer
         region.steps.append(loop)
@@ -235,11 +264,11 @@ class _Lowering:
         return [array([next(results) for _ in range(x.size)], x.shape) for x in like]
 
     def entry(self, x: np.ndarray, at: Value) -> np.ndarray:
-        """x[at] for a counter."""
+        """Return x[at] for a counter."""
         return self.dynamic(x, (at, *[0] * (x.ndim - 1)), (1, *x.shape[1:]))[0]
 
     def while_loop(self, params: dict, args: list[np.ndarray]) -> list[np.ndarray]:
-        """As long as any problem asks for it; the others' values stay."""
+        """Lower a loop that goes on as long as the condition of any lane holds."""
         n_cond, n_body = params["cond_nconsts"], params["body_nconsts"]
         cond_consts, body_consts, inits = args[:n_cond], args[n_cond : n_cond + n_body], args[n_cond + n_body :]
         region = Region(self.builder.region)
@@ -251,7 +280,7 @@ class _Lowering:
         return self.close_loop(loop, out, inits)
 
     def cond(self, params: dict, args: list[np.ndarray]) -> list[np.ndarray]:
-        """Each branch runs where any problem takes it."""
+        """Lower branches: each runs if any lane takes it, and a select picks every lane's own results."""
         index, *operands = args
         branches = params["branches"]
         index = index.item()
@@ -283,14 +312,14 @@ class _Lowering:
         return results
 
     def linear_solve(self, params: dict, args: list[np.ndarray]) -> list[np.ndarray]:
-        """What solves the system, among what JAX is told about it."""
+        """Lower `custom_linear_solve`: run the function that solves the system."""
         lengths, solve = params["const_lengths"], params["jaxprs"].solve
         before = lengths.matvec + lengths.vecmat
         consts, right = args[before : before + lengths.solve], args[sum(lengths) :]
         return self.run(solve.jaxpr, [np.asarray(c) for c in solve.consts], [*consts, *right])
 
     def choose(self, taken: Any, new: list[np.ndarray], old: list[np.ndarray]) -> list[np.ndarray]:
-        """The new arrays where taken, else the old ones."""
+        """Select the new arrays where taken, else the old ones."""
         make = self.builder.make
         out = []
         for these, those in zip(new, old, strict=True):
@@ -299,39 +328,48 @@ class _Lowering:
         return out
 
     def dynamic(self, x: np.ndarray, starts: tuple, sizes: tuple[int, ...]) -> np.ndarray:
-        """A slice that starts where a counter says; XLA moves it inside, and so do we where that is known."""
+        """Slice an array at starts of which at most one is a counter; known starts are clamped as XLA clamps them.
+
+        Raises:
+            Unsupported: more than one start is computed, a start is not a counter, or see `stride`.
+        """
         if all(type(s) is not Value for s in starts):
             corner = [min(max(int(s), 0), n - k) for s, n, k in zip(starts, x.shape, sizes, strict=True)]
             return x[tuple(slice(c, c + k) for c, k in zip(corner, sizes, strict=True))]
         moving = [axis for axis, s in enumerate(starts) if type(s) is Value]
         (axis,) = moving if len(moving) == 1 else (None,)
         if axis is None or starts[axis].kind != "u":
-            raise Unsupported("an index that differs between problems")
+            raise Unsupported("an index that differs between lanes")
         fixed = [
             0 if a == axis else min(max(int(s), 0), n - k)
             for a, (s, n, k) in enumerate(zip(starts, x.shape, sizes, strict=True))
         ]
         first = x[tuple(slice(c, c + k) for c, k in zip(fixed, sizes, strict=True))]
-        source, stride = self.memory(x, axis)
+        stride = self.stride(x, axis)
         out = []
         for v in first.ravel():
-            op, (buffer, (offset, _, _)) = source(v)
-            out.append(self.builder.value(op, (buffer, (offset, starts[axis], stride)), v.kind))
+            moving = v.address._replace(counter=starts[axis], stride=stride)
+            out.append(self.builder.value(v.op, (moving,), v.kind))
         return array(out, first.shape)
 
-    def memory(self, x: np.ndarray, axis: int) -> tuple[Callable, int]:
-        """Where the entries of an array lie, and how far apart along an axis; they are put somewhere if need be."""
+    def stride(self, x: np.ndarray, axis: int) -> int:
+        """Return how many entries of an argument apart the entries of an array lie along an axis.
+
+        Raises:
+            Unsupported: the entries do not lie at equal distances in one argument, at addresses without a counter.
+        """
         flat = np.moveaxis(objects(x), axis, 0).reshape(x.shape[axis], -1)
-        if all(type(v) is Value and v.op in ("own", "shared") and v.args[1][1] is None for v in flat.flat):
-            offsets = np.array([v.args[1][0] for v in flat.flat]).reshape(flat.shape)
+        if all(type(v) is Value and v.op in ("own", "shared") and v.address.counter is None for v in flat.flat):
+            offsets = np.array([v.address.offset for v in flat.flat]).reshape(flat.shape)
             steps = np.diff(offsets, axis=0)
-            if len({(v.op, v.args[0]) for v in flat.flat}) == 1 and (not steps.size or (steps == steps.flat[0]).all()):
-                return (lambda v: (v.op, v.args)), int(steps.flat[0]) if steps.size else 0
+            buffers = {(v.op, v.address.buffer) for v in flat.flat}
+            if len(buffers) == 1 and (not steps.size or (steps == steps.flat[0]).all()):
+                return int(steps.flat[0]) if steps.size else 0
         raise Unsupported("a long loop over computed arrays")
 
 
 def _counters(body: Jaxpr, n_consts: int, n_carry: int, carry: list[np.ndarray]) -> dict[int, tuple[int, bool]]:
-    """Carried integers that every round raises by one, and whether a round uses them for anything else."""
+    """Find carried integers that every round raises by one, and whether a round uses them for anything else."""
     found = {}
     for i in range(n_carry):
         var, out = body.invars[n_consts + i], body.outvars[i]

@@ -1,6 +1,7 @@
-"""What the operations of a jaxpr mean for arrays of scalars.
+"""Rules for the operations of a jaxpr on arrays of scalars.
 
-Each rule takes the lowering, the operation's parameters, the shape and type of the (first) result, and the operands.
+A rule takes the lowering, the operation's parameters, shape and dtype of its (first) result, and the operands. It
+returns the result, or a list of all results.
 """
 
 import math
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgrasp.kernels.program.entries import array, kind_of_scalar, kinds_of, known, like, objects
+from jaxgrasp.kernels.program.entries import array, common_kind, fold_constants, kind_of_scalar, like, objects
 from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
 
 # Operations entry by entry, by the name that JAX gives them.
@@ -24,7 +25,7 @@ ELEMENTWISE["add_any"] = "add"
 
 
 def _select(lower: Any, params: dict, aval: Any, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
-    if len(cases) == 2 and kinds_of(which) == "b":
+    if len(cases) == 2 and common_kind(which) == "b":
         return lower.elementwise("select", [which, cases[1], cases[0]], aval)
     out = cases[-1]
     for number in range(len(cases) - 2, -1, -1):
@@ -35,7 +36,7 @@ def _select(lower: Any, params: dict, aval: Any, which: np.ndarray, *cases: np.n
 
 def _arg(better: str) -> Callable:
     def rule(lower: Any, params: dict, aval: Any, x: np.ndarray) -> np.ndarray:
-        """The first of the best, along one axis."""
+        """Return the index of the first of the best entries along one axis."""
         (axis,) = params["axes"]
         rows = np.moveaxis(objects(x), axis, 0).reshape(x.shape[axis], -1)
         make = lower.builder.make
@@ -53,7 +54,7 @@ def _arg(better: str) -> Callable:
                     wins = make(better, entry, best)
                 best, where = make("select", wins, entry, best), make("select", wins, np.int32(number), where)
             out.append(where)
-        return known(array(out, tuple(aval.shape)), aval.dtype)
+        return fold_constants(array(out, tuple(aval.shape)), aval.dtype)
 
     return rule
 
@@ -87,7 +88,7 @@ def _power(lower: Any, params: dict, aval: Any, x: np.ndarray) -> np.ndarray:
 
 
 def _real_power(lower: Any, params: dict, aval: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Powers that are roots or whole numbers."""
+    """Lower powers whose exponent is the same constant for all entries: an integer, 1/2 or -1/2."""
     exponents = {float(v) for v in objects(y).ravel() if type(v) is not Value}
     if y.dtype == object and any(type(v) is Value for v in y.flat) or len(exponents) != 1:
         raise Unsupported("a power that is computed")
@@ -120,7 +121,9 @@ def _reduce(op: str) -> Callable:
         rows = objects(np.moveaxis(x, axes, range(len(axes)))).reshape(-1, math.prod(kept))
         if not rows.shape[0]:
             raise Unsupported("a reduction of nothing")
-        return known(array([lower.fold(op, list(rows[:, i])) for i in range(rows.shape[1])], kept), aval.dtype)
+        if op in ("and", "or") and kind_of(aval.dtype) != "b":
+            raise Unsupported("bits of integers")
+        return fold_constants(array([lower.fold(op, list(rows[:, i])) for i in range(rows.shape[1])], kept), aval.dtype)
 
     return rule
 
@@ -166,7 +169,7 @@ def _pad(lower: Any, params: dict, aval: Any, x: np.ndarray, value: np.ndarray) 
         target.append(at[inside])
         source.append(np.arange(size)[inside])
     out[np.ix_(*target)] = objects(x)[np.ix_(*source)]
-    return known(out, aval.dtype)
+    return fold_constants(out, aval.dtype)
 
 
 def _dot(lower: Any, params: dict, aval: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -185,7 +188,7 @@ def _dot(lower: Any, params: dict, aval: Any, a: np.ndarray, b: np.ndarray) -> n
         for row in rows
         for column in columns
     ]
-    return known(array(out, tuple(aval.shape)), aval.dtype)
+    return fold_constants(array(out, tuple(aval.shape)), aval.dtype)
 
 
 def _iota(lower: Any, params: dict, aval: Any) -> np.ndarray:
@@ -203,17 +206,17 @@ def _dynamic_update(
 ) -> np.ndarray:
     corner = [s.item() for s in starts]
     if any(type(s) is Value for s in corner):
-        raise Unsupported("an update whose place is not known")
+        raise Unsupported("an update whose place is not fold_constants")
     corner = [min(max(int(s), 0), n - k) for s, n, k in zip(corner, x.shape, new.shape, strict=True)]
     out = objects(x).copy()
     out[tuple(slice(c, c + k) for c, k in zip(corner, new.shape, strict=True))] = objects(new)
-    return known(out, aval.dtype)
+    return fold_constants(out, aval.dtype)
 
 
 def _places(
     shape: tuple[int, ...], window: tuple[int, ...], indices: np.ndarray, sizes: Any, out: tuple, dims: tuple
 ) -> np.ndarray:
-    """For every entry of a gather's result (or a scatter's updates), which entry of the operand it is, counted flat.
+    """Return, for every entry of a gather's result or of a scatter's updates, the number of its entry in the operand.
 
     Args:
         shape: of the operand.
@@ -221,7 +224,11 @@ def _places(
         indices: starts of slices.
         sizes: of a slice along every axis of the operand.
         out: shape of the result.
-        dims: axes of the operand that slices have not; those that the starts are of; operand's and indices' batch axes.
+        dims: axes of the operand that slices do not have, axes that the starts count along, and the batch axes of
+            operand and indices.
+
+    Raises:
+        Unsupported: an index is computed, or out of bounds.
     """
     if indices.dtype == object:
         raise Unsupported("indices that are computed")
@@ -266,13 +273,13 @@ def _scatter(combine: str | None) -> Callable:
         out = objects(x).ravel().copy()
         for place, value in zip(places.ravel(), objects(new).ravel(), strict=True):
             out[place] = value if combine is None else lower.builder.make(combine, out[place], value)
-        return known(out.reshape(x.shape), aval.dtype)
+        return fold_constants(out.reshape(x.shape), aval.dtype)
 
     return rule
 
 
 def _cholesky(lower: Any, params: dict, aval: Any, x: np.ndarray) -> np.ndarray:
-    """L with L L' = x; NaN where a pivot is negative."""
+    """Lower the factorisation x = L L'; L has NaN where a pivot is negative."""
     make, size = lower.builder.make, x.shape[-1]
     out = np.empty(x.shape, object)
     out[...] = lower.builder.dtype.type(0)
@@ -284,11 +291,11 @@ def _cholesky(lower: Any, params: dict, aval: Any, x: np.ndarray) -> np.ndarray:
                 for k in range(j):
                     value = make("sub", value, make("mul", root[i, k], root[j, k]))
                 root[i, j] = make("sqrt", value) if i == j else make("div", value, root[j, j])
-    return known(out, aval.dtype)
+    return fold_constants(out, aval.dtype)
 
 
 def _triangular(lower: Any, params: dict, aval: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Substitution."""
+    """Solve by forward or backward substitution."""
     if not params["left_side"] or params["conjugate_a"]:
         raise Unsupported("triangular solves from the right")
     make, size = lower.builder.make, a.shape[-1]
@@ -305,7 +312,7 @@ def _triangular(lower: Any, params: dict, aval: Any, a: np.ndarray, b: np.ndarra
                     value = make("sub", value, make("mul", matrix[i, k], out[index][k, column]))
                 out[index][i, column] = value if params["unit_diagonal"] else make("div", value, matrix[i, i])
                 done.append(i)
-    return known(out, aval.dtype)
+    return fold_constants(out, aval.dtype)
 
 
 RULES: dict[str, Callable] = {

@@ -1,7 +1,7 @@
-"""The order in which a program's values are computed, and when each is used.
+"""Put a program's values in the order in which they are computed, and record when each is used.
 
 A program becomes one list of events. Values are computed depth first, when they are first needed, so that few have to
-be kept at a time; a product that is used once, in a sum, becomes part of it.
+be kept at a time; a product that is used once, in a sum, becomes part of a fused multiply-add.
 """
 
 from collections import Counter
@@ -9,18 +9,20 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from jaxgrasp.kernels.program.contraction import chain_sums
 from jaxgrasp.kernels.program.expressions import Region, Value
-from jaxgrasp.kernels.program.lowering import Guard, Loop, Program
-from jaxgrasp.kernels.program.sums import chain_sums
+from jaxgrasp.kernels.program.lowering import Guard, Loop, ScalarProgram
 
 Step = Loop | Guard
 
 
 @dataclass(eq=False)
 class Event:
-    """Something that happens: `what` is "compute", "store" (a result of the program), "enter", "test" or "leave".
+    """Something that a kernel does.
 
-    subject: the value that is computed, the number of the result, or the loop or guard.
+    what: "compute" a value, "store" a result of the program, "enter" or "leave" a loop or guard, or "test" a loop's
+        condition.
+    subject: the value, the number of the result, or the loop or guard.
     uses: the values that are needed for it.
     """
 
@@ -31,11 +33,12 @@ class Event:
 
 @dataclass
 class Schedule:
-    """Events in order.
+    """The events of a program in order.
 
-    fused: products that are part of a sum.
-    uses: where each value is used, as numbers of events; a use in a loop that its value is not of lasts to its end.
-    last: the last of them.
+    fused: products that are computed within a sum, as a fused multiply-add.
+    uses: event indices of each use of a value.
+    last: the index of the last event up to which a value is needed; a loop that reads a value from outside needs it
+        until the loop ends.
     """
 
     events: list[Event]
@@ -45,36 +48,36 @@ class Schedule:
 
 
 def in_memory(value: Value) -> bool:
-    """Whether a value is read from memory wherever it is used."""
+    """Tell whether a value is not computed, but read from memory wherever it is used."""
     return value.op in ("own", "shared", "carry", "result")
 
 
-def scheduled(program: Program) -> Schedule:
-    """Put a program in order."""
+def schedule(program: ScalarProgram) -> Schedule:
+    """Put a program in order. Its sums are changed in place, so that a program can be scheduled only once."""
     results = [x for out in program.outputs for x in out.flat]
-    values, count = _used(program.builder.region, results)
-    order = _Order(_products(chain_sums(values, count), count))
+    values, count = _collect_used(program.builder.region, results)
+    order = _Order(_find_fused(chain_sums(values, count), count))
     order.region(program.builder.region, results)
     for number, value in enumerate(results):
         order.events.append(Event("store", number, _values([value])))
-    schedule = Schedule(_spread(order.events), order.fused)
-    _count(schedule)
-    return schedule
+    found = Schedule(_interleave(order.events), order.fused)
+    _record_uses(found)
+    return found
 
 
-# Values that wait for their turn beside each other, and how long a value takes, in values.
+# How many computations are considered for the next place, and how many cycles a value takes; all others take 4.
 _WINDOW = 64
 _LATENCY = {"div": 14, "rsqrt": 18, "sqrt": 24}
 
 
-def _spread(events: list[Event]) -> list[Event]:
-    """The same in an order in which values are ready when they are needed, as far as a few events can be exchanged.
+def _interleave(events: list[Event]) -> list[Event]:
+    """Reorder computations within a window, so that operands are ready when they are needed (list scheduling).
 
-    One value a cycle begins. Where none of the next ones has all it needs, the one that has it first is next.
+    One value begins in every cycle: the first whose operands are ready, else the one whose operands are ready soonest.
     """
     out: list[Event] = []
     finished: dict[Value, int] = {}
-    # With each event that waits, when it has all it needs; None as long as that is not known.
+    # The events in the window, each with the cycle in which its operands are ready; None while that is not known.
     waiting: list[tuple[Event, int | None]] = []
     pending: set[Value] = set()
     time = place = 0
@@ -108,9 +111,9 @@ def _spread(events: list[Event]) -> list[Event]:
 
 
 def operands(value: Value, fused: set[Value]) -> list[Value]:
-    """What has to be known to compute a value: its operands, and where those lie that are in memory."""
+    """Return what has to be known to compute a value: its operands, and the counters of their addresses."""
     if value.op in ("own", "shared"):
-        return _values([value.args[1][1]])
+        return _values([value.address.counter])
     if value.op in ("carry", "result", "counter"):
         return []
     needed: list[Value] = []
@@ -121,26 +124,28 @@ def operands(value: Value, fused: set[Value]) -> list[Value]:
             needed += [y for y in x.args if type(y) is Value]
         else:
             needed.append(x)
-    return _addressed(needed)
+    return _with_counters(needed)
 
 
-def _addressed(values: list[Value]) -> list[Value]:
-    """With what the addresses of those in memory depend on."""
-    far = [x.args[1][1] for x in values if x.op in ("own", "shared")]
+def _with_counters(values: list[Value]) -> list[Value]:
+    """Append the counters that the addresses of values in memory depend on."""
+    far = [x.address.counter for x in values if x.op in ("own", "shared")]
     return values + _values(far) if far else values
 
 
 def _values(entries: Iterable[Any]) -> list[Value]:
+    """Leave constants out."""
     return [x for x in entries if type(x) is Value]
 
 
 def _roots(step: Step) -> list[Any]:
+    """Return what a step needs: to begin, to be tested, and of its body."""
     entered = [*step.initial, step.condition] if isinstance(step, Loop) else [step.condition]
     return [*entered, *step.outputs]
 
 
-def _used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Value]]:
-    """All values that are needed, and how often."""
+def _collect_used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Value]]:
+    """Return all values that are needed, and how often each is."""
     count: Counter[Value] = Counter()
     seen: dict[Value, None] = {}
     stack: list[Value] = []
@@ -169,8 +174,8 @@ def _used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Valu
     return list(seen), count
 
 
-def _products(sums: list[Value], count: Counter[Value]) -> set[Value]:
-    """Products that can be part of a sum: used once, where they are computed."""
+def _find_fused(sums: list[Value], count: Counter[Value]) -> set[Value]:
+    """Choose at most one product of every sum for a fused multiply-add: it is used once, in its own region."""
     fused: set[Value] = set()
     for value in sums:
         for x in _values(value.args):
@@ -181,18 +186,25 @@ def _products(sums: list[Value], count: Counter[Value]) -> set[Value]:
 
 
 class _Order:
+    """Collects the events of a program, values depth first.
+
+    Args:
+        fused: products that are not computed by themselves.
+    """
+
     def __init__(self, fused: set[Value]) -> None:
         self.fused = fused
         self.events: list[Event] = []
         self.done: set[Value] = set()
 
     def region(self, region: Region, results: Iterable[Any]) -> None:
-        """Steps, and what is asked for after them."""
+        """Add a region: its steps, then what is asked for after them."""
         for step in region.steps:
             self.step(step, region)
         self.compute_all(results)
 
     def step(self, step: Step, region: Region) -> None:
+        """Add a loop or guard; what it reads from outside is computed before it."""
         for value in self.outside(step, region):
             self.compute(value)
         body = step.body
@@ -209,11 +221,12 @@ class _Order:
         self.events.append(Event("leave", step, _values(step.outputs)))
 
     def compute_all(self, entries: Iterable[Any]) -> None:
-        for value in _addressed(_values(entries)):
+        """Add scalars that are not there yet."""
+        for value in _with_counters(_values(entries)):
             self.compute(value)
 
     def compute(self, root: Value) -> None:
-        """A value, and first what it is made of."""
+        """Add a value that is not there yet, after its operands."""
         stack = [root]
         while stack:
             value = stack[-1]
@@ -230,7 +243,7 @@ class _Order:
             self.events.append(Event("compute", value, needed))
 
     def outside(self, step: Step, region: Region) -> list[Value]:
-        """What a step needs of the code around it."""
+        """Find the values that a step reads of the code around it."""
         found: dict[Value, None] = {}
         seen: set[Value] = set()
 
@@ -255,8 +268,8 @@ class _Order:
         return list(found)
 
 
-def _count(schedule: Schedule) -> None:
-    """When values are used."""
+def _record_uses(schedule: Schedule) -> None:
+    """Fill in `uses` and `last`."""
     inside: list[tuple[Step, int]] = []
     ends: dict[Step, int] = {e.subject: i for i, e in enumerate(schedule.events) if e.what == "leave"}
     for number, event in enumerate(schedule.events):

@@ -1,1 +1,1 @@
-"""Compiled kernels on disk, and the names under which they are found again."""
+"""The code cache: compiled kernels on disk, and the keys that they are found by."""

@@ -1,4 +1,4 @@
-"""Names of programs, by which compiled kernels are found again: of what they are, or of what they come from."""
+"""Keys that compiled kernels are found by on disk: hashes of the program, or of the function that it is traced from."""
 
 import functools
 import hashlib
@@ -11,30 +11,50 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxgrasp.kernels.program.entries import aval_of
 
+# Parameters that only matter to XLA, and may differ between traces of the same program.
+_INCIDENTAL = {
+    *("name", "jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "ctx_mesh", "donated_invars"),
+    *("compiler_options_kvs", "in_shardings", "out_shardings", "in_layouts", "out_layouts"),
+    *("sharding", "out_sharding"),
+}
 
-def of_origin(known_as: str, given: list[jax.ShapeDtypeStruct], shared: tuple[bool, ...], described: str) -> str:
-    """The same for functions that are known by the same name and get the same arguments.
 
-    It holds for one version of JAX and one state of the whole package, any file of which may be what is traced, and
-    for the devices that are described.
+def hash_origin(
+    known_as: str, arguments: list[jax.ShapeDtypeStruct], shared: tuple[bool, ...], description: str
+) -> str:
+    """Hash what a program is traced from: a function, by its name, and its arguments' shapes and types.
+
+    The hash depends on the version of JAX and on the source of the whole package, any file of which may be traced.
+
+    Args:
+        known_as: the function's name, see `kernels.fused`.
+        arguments: shape and type of every argument.
+        shared: for every argument, whether all lanes share it.
+        description: the target's description of its devices.
     """
-    package = _source(Path(__file__).parents[2])
-    arguments = [(x.shape, x.dtype.name, s) for x, s in zip(given, shared, strict=True)]
-    parts = (package, described, jax.__version__, jax.config.read("jax_enable_x64"))
-    return hashlib.sha256(repr((*parts, known_as, arguments)).encode()).hexdigest()
+    package = _hash_sources(Path(__file__).parents[2])
+    signature = [(x.shape, x.dtype.name, s) for x, s in zip(arguments, shared, strict=True)]
+    parts = (package, description, jax.__version__, jax.config.read("jax_enable_x64"))
+    return hashlib.sha256(repr((*parts, known_as, signature)).encode()).hexdigest()
 
 
 @functools.cache
-def _source(folder: Path) -> str:
-    """Changes whenever a file does, and with it what is traced or compiled."""
+def _hash_sources(folder: Path) -> str:
+    """Hash all source files of a folder: what is traced or compiled changes only with them."""
     files = sorted(folder.rglob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
-def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], described: str) -> str:
-    """The same for programs that are the same, in any process with devices that are described so."""
-    room = _source(Path(__file__).parents[1])
-    digest = hashlib.sha256(f"{room} {described} {shared}".encode())
+def hash_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], description: str) -> str:
+    """Hash a program; the hash is the same in every process with the same devices.
+
+    Args:
+        jaxpr: the program.
+        shared: for every argument, whether all lanes share it.
+        description: the target's description of its devices.
+    """
+    room = _hash_sources(Path(__file__).parents[1])
+    digest = hashlib.sha256(f"{room} {description} {shared}".encode())
     numbers: dict[Any, int] = {}
 
     def name(v: Any) -> str:
@@ -63,19 +83,11 @@ def of_program(jaxpr: ClosedJaxpr, shared: tuple[bool, ...], described: str) -> 
         for v in (*inner.constvars, *inner.invars):
             digest.update(f"{name(v)}={aval_of(v).dtype}{aval_of(v).shape};".encode())
         for eqn in inner.eqns:
-            # What only matters to XLA, and may differ between traces of the same program.
             params = {k: v for k, v in eqn.params.items() if k not in _INCIDENTAL}
-            said = [eqn.primitive.name, *map(name, eqn.invars), *[f"{k}={plain(v)}" for k, v in params.items()]]
+            parts = [eqn.primitive.name, *map(name, eqn.invars), *[f"{k}={plain(v)}" for k, v in params.items()]]
             outs = [f"{name(v)}={aval_of(v).dtype}{aval_of(v).shape}" for v in eqn.outvars]
-            digest.update((" ".join([*said, *outs]) + "\n").encode())
+            digest.update((" ".join([*parts, *outs]) + "\n").encode())
         digest.update(("->" + ",".join(map(name, inner.outvars))).encode())
 
     plain(jaxpr)
     return digest.hexdigest()
-
-
-_INCIDENTAL = {
-    *("name", "jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "ctx_mesh", "donated_invars"),
-    *("compiler_options_kvs", "in_shardings", "out_shardings", "in_layouts", "out_layouts"),
-    *("sharding", "out_sharding"),
-}

@@ -5,8 +5,8 @@ import hashlib
 from jaxgrasp.storage import FileError, atomic_write, cache_folder, open_regular
 
 
-def cached(key: str) -> bytes | None:
-    """Read what was kept under this key; None unless it is whole and only this user could have written it."""
+def read(key: str) -> bytes | None:
+    """Read what is kept under a key; None unless it is whole and only this user could have written it."""
     try:
         with open_regular(cache_folder("kernels") / key) as stream:
             content = stream.read()
@@ -17,7 +17,7 @@ def cached(key: str) -> bytes | None:
 
 
 def keep(key: str, content: bytes) -> None:
-    """Keep object code, or what is known of a program.
+    """Keep content, such as object code, under a key.
 
     Raises:
         OSError: the folder cannot be written, or others could write to it.

@@ -1,27 +1,28 @@
-"""How a block of problems is solved: LLVM code around the functions that `cpu` writes.
+"""Lane compaction: LLVM code that runs the main loop of a program only on vectors most of whose lanes need it.
 
-Some problems take longer than the others of their block. A vector of which few lanes still do something is not worth a
-round: these lanes go to a second frame, where they wait for those of later blocks until it is full. Nothing else of a
-lane changes, so its result does not depend on its company.
+Some lanes take more rounds than the others of their block. A vector of which few lanes (a quarter) are unfinished is
+not worth a round: these lanes are moved to a second frame, the thread's spill frame (`%spill`), where they wait for
+lanes of later blocks until it is nearly full. Nothing else of a lane changes, so its result does not depend on the
+other lanes of its block.
 
-What a thread keeps beside its two frames, its book, in words: how many lanes wait, the rows that these are of, and from
-where to where lanes are being moved.
+Beside its two frames a thread has a work queue (`%queue`), an array of words: how many lanes wait, their rows, and the
+sources and targets of the lanes that are being moved.
 """
 
-from jaxgrasp.kernels.cpu.vectors import VectorCode
+from jaxgrasp.kernels.cpu.vectors import Body
 
-# Bytes of two frames, which are on a thread's stack; where they would be more, nothing waits.
+# The most bytes of two frames, which are on a thread's stack; where they would be more, no lane waits.
 _MOST_FRAMES = 3 << 17
 
 _ALONE = """
-define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
+define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %spill, ptr %queue) {
   call void @before(ptr %state, i64 %number, ptr %frame)
 @ROUNDS@
   call void @unpack(ptr %state, i64 %number, ptr %frame)
   ret void
 }
 
-define internal void @finish(ptr %state, ptr %rest, ptr %book) {
+define internal void @finish(ptr %state, ptr %spill, ptr %queue) {
   ret void
 }
 """
@@ -29,7 +30,7 @@ define internal void @finish(ptr %state, ptr %rest, ptr %book) {
 _ROUNDS = """  %finished = call i64 @rounds(ptr %state, ptr %frame, i64 0)
   call void @after(ptr %state, ptr %frame)"""
 
-# A value of all lanes is a line of the cache: each is touched once.
+# Lanes are moved value by value, since a value of all lanes is a line of the cache: each is touched once.
 _MOVE = """
 define internal void @move.@TABLE@(ptr %a, ptr %b, ptr %sources, ptr %targets, i64 %lanes) {
 entry:
@@ -70,10 +71,10 @@ out:
 _TOGETHER = """
 @TABLES@
 @MOVES@
-define internal void @move(ptr %a, ptr %b, ptr %book, i64 %lanes) {
+define internal void @move(ptr %a, ptr %b, ptr %queue, i64 %lanes) {
 entry:
-  %sources = getelementptr i64, ptr %book, i64 @SOURCES@
-  %targets = getelementptr i64, ptr %book, i64 @TARGETS@
+  %sources = getelementptr i64, ptr %queue, i64 @SOURCES@
+  %targets = getelementptr i64, ptr %queue, i64 @TARGETS@
   %none = icmp eq i64 %lanes, 0
   br i1 %none, label %out, label %some
 some:
@@ -87,16 +88,16 @@ out:
 
 declare i64 @llvm.cttz.i64(i64, i1)
 
-define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %rest, ptr %book) {
+define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %spill, ptr %queue) {
 entry:
   call void @before(ptr %state, i64 %number, ptr %frame)
-  %unfinished = call i64 @rounds(ptr %state, ptr %frame, i64 @FEW@)
+  %unfinished = call i64 @rounds(ptr %state, ptr %frame, i64 @THRESHOLD@)
   %rows = load i64, ptr %state
   %first = mul i64 %number, @WIDTH@
-  %waiting = load i64, ptr %book
-  %book.rows = getelementptr i64, ptr %book, i64 1
-  %book.sources = getelementptr i64, ptr %book, i64 @SOURCES@
-  %book.targets = getelementptr i64, ptr %book, i64 @TARGETS@
+  %waiting = load i64, ptr %queue
+  %queue.rows = getelementptr i64, ptr %queue, i64 1
+  %queue.sources = getelementptr i64, ptr %queue, i64 @SOURCES@
+  %queue.targets = getelementptr i64, ptr %queue, i64 @TARGETS@
   br label %more
 more:
   %lanes = phi i64 [ %unfinished, %entry ], [ %others, %counted ]
@@ -109,9 +110,9 @@ one:
   %others = and i64 %lanes, %less
   %row = add i64 %first, %lane
   %target = add i64 %waiting, %moved
-  %row.p = getelementptr i64, ptr %book.rows, i64 %target
-  %source.p = getelementptr i64, ptr %book.sources, i64 %moved
-  %target.p = getelementptr i64, ptr %book.targets, i64 %moved
+  %row.p = getelementptr i64, ptr %queue.rows, i64 %target
+  %source.p = getelementptr i64, ptr %queue.sources, i64 %moved
+  %target.p = getelementptr i64, ptr %queue.targets, i64 %moved
   store i64 %row, ptr %row.p
   store i64 %lane, ptr %source.p
   store i64 %target, ptr %target.p
@@ -122,26 +123,26 @@ one:
 counted:
   br label %more
 listed:
-  call void @move(ptr %frame, ptr %rest, ptr %book, i64 %moved)
+  call void @move(ptr %frame, ptr %spill, ptr %queue, i64 %moved)
   %kept = add i64 %waiting, %moved
-  store i64 %kept, ptr %book
+  store i64 %kept, ptr %queue
   call void @after(ptr %state, ptr %frame)
   call void @unpack(ptr %state, i64 %number, ptr %frame)
   %full = icmp ugt i64 %kept, @ALMOST@
   br i1 %full, label %complete, label %out
 complete:
-  call void @finish(ptr %state, ptr %rest, ptr %book)
+  call void @finish(ptr %state, ptr %spill, ptr %queue)
   br label %out
 out:
   ret void
 }
 
-define internal void @finish(ptr %state, ptr %rest, ptr %book) {
+define internal void @finish(ptr %state, ptr %spill, ptr %queue) {
 entry:
-  %book.rows = getelementptr i64, ptr %book, i64 1
-  %book.sources = getelementptr i64, ptr %book, i64 @SOURCES@
-  %book.targets = getelementptr i64, ptr %book, i64 @TARGETS@
-  %count = load i64, ptr %book
+  %queue.rows = getelementptr i64, ptr %queue, i64 1
+  %queue.sources = getelementptr i64, ptr %queue, i64 @SOURCES@
+  %queue.targets = getelementptr i64, ptr %queue, i64 @TARGETS@
+  %count = load i64, ptr %queue
   %none = icmp eq i64 %count, 0
   br i1 %none, label %out, label %fill
 fill:
@@ -150,19 +151,19 @@ fill:
   %more = icmp ult i64 %lane, @WIDTH@
   br i1 %more, label %copy, label %run
 copy:
-  %source.p = getelementptr i64, ptr %book.sources, i64 %empty
-  %target.p = getelementptr i64, ptr %book.targets, i64 %empty
+  %source.p = getelementptr i64, ptr %queue.sources, i64 %empty
+  %target.p = getelementptr i64, ptr %queue.targets, i64 %empty
   store i64 0, ptr %source.p
   store i64 %lane, ptr %target.p
   %lane.next = add i64 %lane, 1
   %empty.next = add i64 %empty, 1
   br label %fill
 run:
-  call void @move(ptr %rest, ptr %rest, ptr %book, i64 %empty)
-  %unfinished = call i64 @rounds(ptr %state, ptr %rest, i64 0)
-  call void @after(ptr %state, ptr %rest)
-  call void @unpack_rows(ptr %state, ptr %book.rows, i64 %count, ptr %rest)
-  store i64 0, ptr %book
+  call void @move(ptr %spill, ptr %spill, ptr %queue, i64 %empty)
+  %unfinished = call i64 @rounds(ptr %state, ptr %spill, i64 0)
+  call void @after(ptr %state, ptr %spill)
+  call void @unpack_rows(ptr %state, ptr %queue.rows, i64 %count, ptr %spill)
+  store i64 0, ptr %queue
   br label %out
 out:
   ret void
@@ -170,21 +171,21 @@ out:
 """
 
 
-def waits(code: VectorCode) -> bool:
-    """Whether there is a loop that some problems take longer for, and room for a second frame."""
-    return code.main is not None and 2 * code.used <= _MOST_FRAMES
+def compacts(body: Body) -> bool:
+    """Tell whether a program has a main loop, and the stack room for a second frame."""
+    return body.has_main_loop and 2 * body.frame_bytes <= _MOST_FRAMES
 
 
-def blocks(code: VectorCode) -> str:
-    """The functions `block` and `finish` of a program that is written."""
-    if not waits(code):
-        return _ALONE.replace("@ROUNDS@", _ROUNDS if code.main else "")
-    width, few = code.width, code.width // 4
+def write_block(body: Body) -> str:
+    """Write the function `block`, which runs the program on a block of lanes, and `finish`, for the lanes that wait."""
+    if not compacts(body):
+        return _ALONE.replace("@ROUNDS@", _ROUNDS if body.has_main_loop else "")
+    width, threshold = body.width, body.width // 4
     values = {
-        "@MOVES@": _moves(),
-        "@TABLES@": _tables(code),
-        "@FEW@": str(few),
-        "@ALMOST@": str(width - few),
+        "@MOVES@": _write_moves(),
+        "@TABLES@": _write_tables(body),
+        "@THRESHOLD@": str(threshold),
+        "@ALMOST@": str(width - threshold),
         "@SOURCES@": str(1 + width),
         "@TARGETS@": str(1 + 2 * width),
         "@WIDTH@": str(width),
@@ -195,18 +196,18 @@ def blocks(code: VectorCode) -> str:
     return text
 
 
-def _moves() -> str:
-    """How a lane's data are copied to another one: numbers, integers and truth values."""
+def _write_moves() -> str:
+    """Write the functions that copy a lane's state to another lane: words, longs and flags, of 4, 8 and 1 bytes."""
     units = {"words": "i32", "longs": "i64", "flags": "i8"}
     return "".join(_MOVE.replace("@UNIT@", unit).replace("@TABLE@", name) for name, unit in units.items())
 
 
-def _tables(code: VectorCode) -> str:
-    """Where a lane's data lie in a frame: offsets of numbers, of integers and of truth values."""
-    sizes = {"f": code.dtype.itemsize, "i": 4, "b": 1}
+def _write_tables(body: Body) -> str:
+    """Write the offsets of a lane's state in a frame: of words, longs and flags."""
+    sizes = {"f": body.float_bytes, "i": 4, "b": 1}
     lines = []
     for name, size in (("words", 4), ("longs", 8), ("flags", 1)):
-        offsets = sorted(offset for offset, kind in code.live.items() if sizes[kind] == size)
+        offsets = sorted(offset for offset, kind in body.lane_state.items() if sizes[kind] == size)
         entries = ", ".join(f"i32 {offset}" for offset in offsets or [0])
         lines.append(f"@{name} = internal constant [{max(1, len(offsets))} x i32] [{entries}]")
         lines.append(f"@{name}.count = internal constant i64 {len(offsets)}")
