@@ -18,9 +18,16 @@ import numpy as np
 
 from jaxgrasp.arrays import fold, literal
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers.block.kkt import inverse_root, spread_over
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
-from jaxgrasp.solvers.small_matrices import back, cholesky
+from jaxgrasp.solvers.small_matrices import (
+    cholesky_3x3,
+    inverse_cholesky,
+    matvec,
+    matvec_transposed,
+    solve_3x3,
+    spread_over,
+    sum_over_blocks,
+)
 
 
 class ArrowRecord(NamedTuple):
@@ -84,15 +91,15 @@ class ArrowProblem:
 
     def apply(self, x: jax.Array) -> jax.Array:
         """A x."""
-        return fold(jnp.add, spread_over(self.patterns.T, x) * x[:, None])
+        return matvec_transposed(spread_over(self.patterns.T, x), x)
 
     def adjoint(self, z: jax.Array) -> jax.Array:
         """A'z."""
-        return fold(jnp.add, spread_over(self.patterns, z) * z[:, None])
+        return matvec_transposed(spread_over(self.patterns, z), z)
 
     def equality(self, x: jax.Array) -> jax.Array:
         """E x, (eq, copies, *lanes)."""
-        return _over_blocks(self.columns * x)
+        return sum_over_blocks(self.columns * x)
 
     def pull_back(self, y: jax.Array) -> jax.Array:
         """E'y."""
@@ -104,15 +111,15 @@ class ArrowProblem:
 
     def gradient(self, x: jax.Array) -> jax.Array:
         """Of the objective."""
-        moved = _times(self.change, x[:, :, :-1] - x[:, :, -1:])
-        rest = _times(self.own, x[:, :, -1:]) - _copies(moved)
+        moved = matvec(self.change, x[:, :, :-1] - x[:, :, -1:])
+        rest = matvec(self.own, x[:, :, -1:]) - _copies(moved)
         return jnp.concatenate([moved, rest], 2)
 
     def objective(self, x: jax.Array) -> jax.Array:
         """Of x, (*lanes)."""
         moved = x[:, :, :-1] - x[:, :, -1:]
         return 0.5 * (
-            _total(moved * _times(self.change, moved)) + _total(x[:, :, -1:] * _times(self.own, x[:, :, -1:]))
+            _total(moved * matvec(self.change, moved)) + _total(x[:, :, -1:] * matvec(self.own, x[:, :, -1:]))
         )
 
     def start(self) -> Iterate:
@@ -138,10 +145,10 @@ class ArrowProblem:
                 fold(jnp.add, spread_over(self.patterns[:, a] * self.patterns[:, b], weights) * weights)
                 for a, b in pairs
             ]
-            lower = cholesky([g[:, :-1] + self.change[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
-            follow = jnp.stack([back(lower, self.change[:, b]) for b in range(3)], 1)
-            solved = jnp.stack([back(lower, self.columns[r]) for r in range(eq)])
-            matrix = jnp.stack([_over_blocks(self.columns * solved[r]) for r in range(eq)])
+            lower = cholesky_3x3([g[:, :-1] + self.change[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
+            follow = jnp.stack([solve_3x3(lower, self.change[:, b]) for b in range(3)], 1)
+            solved = jnp.stack([solve_3x3(lower, self.columns[r]) for r in range(eq)])
+            matrix = jnp.stack([sum_over_blocks(self.columns * solved[r]) for r in range(eq)])
             across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
             full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(3) for b in range(3)]
             hub = jnp.stack(full).reshape(3, 3, *full[0].shape)[:, :, :, -1:] + self.own
@@ -151,7 +158,7 @@ class ArrowProblem:
 
         lower, follow, matrix, across, hub = blocks(weights)
         eye = jnp.eye(eq, dtype=weights.dtype).reshape(eq, eq, *[1] * (self.rhs.ndim - 1))
-        roots = inverse_root(matrix + eye * self.dropped)
+        roots = inverse_cholesky(matrix + eye * self.dropped)
 
         @fenced
         def couple(roots: jax.Array, across: jax.Array, hub: jax.Array) -> tuple:
@@ -162,7 +169,7 @@ class ArrowProblem:
             return reach, whole + blocks.reshape(3 * n, 3 * n, *self.lanes)
 
         reach, whole = couple(roots, across, hub)
-        inverse = inverse_root(whole)
+        inverse = inverse_cholesky(whole)
 
         @fenced
         def tie(inverse: jax.Array) -> tuple:
@@ -177,7 +184,7 @@ class ArrowProblem:
             roots,
             reach,
             inverse,
-            inverse_root(tied + eye[..., 0, :] * self.dropped[:, 0]),
+            inverse_cholesky(tied + eye[..., 0, :] * self.dropped[:, 0]),
             turned,
             weights,
         )
@@ -188,22 +195,22 @@ class ArrowProblem:
 
         @fenced
         def newton(rhs: jax.Array, rhs_y: jax.Array) -> tuple:
-            first = back(factors.lower, rhs[:, :, :-1])
-            lacking = _rows(factors.roots, self.equality(first) - rhs_y[:, :-1])
+            first = solve_3x3(factors.lower, rhs[:, :, :-1])
+            lacking = matvec(factors.roots, self.equality(first) - rhs_y[:, :-1])
             push = fold(jnp.add, factors.reach * lacking[:, None, None])
             # H (P^-1 r - P^-1 E' M^-1 (..)), the second term by the transpose of `reach`.
-            right = rhs[:, :, -1:] + _copies(_times(self.change, first) - push)
+            right = rhs[:, :, -1:] + _copies(matvec(self.change, first) - push)
             flat = jnp.swapaxes(right[:, :, 0], 0, 1).reshape(3 * n, *self.lanes)
-            half = _rows(factors.hub, flat)
-            y = _rows(
+            half = matvec(factors.hub, flat)
+            y = matvec(
                 factors.hub_root, fold(jnp.add, jnp.swapaxes(factors.hub_columns, 0, 1) * half[:, None]) - rhs_y[:, -1]
             )
-            y = _columns(factors.hub_root, y)
-            rest = _columns(factors.hub, half - fold(jnp.add, factors.hub_columns * y[:, None]))
+            y = matvec_transposed(factors.hub_root, y)
+            rest = matvec_transposed(factors.hub, half - fold(jnp.add, factors.hub_columns * y[:, None]))
             rest = jnp.swapaxes(rest.reshape(n, 3, *self.lanes), 0, 1)[:, :, None]
-            moved = lacking + _over_blocks(factors.reach * rest)
-            own_y = _columns(factors.roots, moved)
-            own = first + _times(factors.follow, rest) - back(factors.lower, self.pull_back(own_y))
+            moved = lacking + sum_over_blocks(factors.reach * rest)
+            own_y = matvec_transposed(factors.roots, moved)
+            own = first + matvec(factors.follow, rest) - solve_3x3(factors.lower, self.pull_back(own_y))
             return jnp.concatenate([own, rest], 2), jnp.concatenate([own_y, y[:, None]], 1)
 
         def improve(_: jax.Array, state: tuple) -> tuple:
@@ -264,29 +271,9 @@ def patterns_of(facets: np.ndarray, dtype: jnp.dtype, axes: int) -> tuple[jax.Ar
     return rows, literal(np.array([0.0] * len(facets) + [1.0]), dtype).reshape(-1, *[1] * axes)
 
 
-def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
-    """Blocks (3, 3, n, ...) times (3, n, ...)."""
-    return fold(jnp.add, jnp.swapaxes(matrix, 0, 1) * x[:, None])
-
-
-def _rows(matrix: jax.Array, v: jax.Array) -> jax.Array:
-    """M v, of (r, c, ...)."""
-    return fold(jnp.add, jnp.swapaxes(matrix, 0, 1) * v[:, None])
-
-
-def _columns(matrix: jax.Array, v: jax.Array) -> jax.Array:
-    """M'v."""
-    return fold(jnp.add, matrix * v[:, None])
-
-
 def _copies(x: jax.Array, axis: int = 2) -> jax.Array:
     """Sum over copies, which stay as an axis of length one."""
     return jnp.sum(x, axis, keepdims=True)
-
-
-def _over_blocks(x: jax.Array) -> jax.Array:
-    """Sum over components and blocks, (eq, 3, n, copies, *lanes) -> (eq, copies, *lanes)."""
-    return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(x, 1, 0)), 1, 0))
 
 
 def _total(x: jax.Array) -> jax.Array:

@@ -23,12 +23,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.lanes.fence import each, fenced, repeat
+from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
+from jaxgrasp.solvers.small_matrices import inverse_cholesky, matvec_transposed, spread_over
 
 Rows = tuple[jax.Array, ...]
-# Matrices of the equality rows up to this size are factored as they are.
-_UNDIVIDED = 16
 
 
 class Blocks(NamedTuple):
@@ -96,23 +95,18 @@ class Factors(NamedTuple):
 
 def apply_rows(group: Blocks, x: jax.Array) -> jax.Array:
     """A x: (k, n, *lanes) -> (m, n, *lanes)."""
-    return fold(jnp.add, spread_over(group.patterns.T, x) * x[:, None])
+    return matvec_transposed(spread_over(group.patterns.T, x), x)
 
 
 def adjoint_rows(group: Blocks, z: jax.Array) -> jax.Array:
     """A'z: (m, n, *lanes) -> (k, n, *lanes)."""
-    return fold(jnp.add, spread_over(group.patterns, z) * z[:, None])
+    return matvec_transposed(spread_over(group.patterns, z), z)
 
 
 def apply_hessian(group: Blocks, x: jax.Array) -> jax.Array:
     """H x = root' root x, (k, n, *lanes)."""
     half = fold(jnp.add, jnp.moveaxis(group.root * x, 1, 0))
     return fold(jnp.add, group.root * half[:, None])
-
-
-def spread_over(values: jax.Array, like: jax.Array) -> jax.Array:
-    """Append axes, to weigh arrays of which `like` is one along its leading axis."""
-    return values.reshape(values.shape + (1,) * (like.ndim - 1))
 
 
 def total(x: jax.Array) -> jax.Array:
@@ -148,54 +142,6 @@ def _substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[j
             out[i] = out[i] - below[j * (j - 1) // 2 + i] * out[j]
         out[i] = out[i] * inverse[i]
     return out
-
-
-def inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array:
-    """L^-1 of a symmetric positive definite (eq, eq, *lanes).
-
-    Pivots are clamped at a floor (eq, *lanes), eps of the diagonal. Large matrices are cut in two: L^-1 is made of
-    those of a corner and of what is left of the other one, a third of the work.
-    """
-    size, lanes = matrix.shape[0], matrix.shape[2:]
-    index = jnp.arange(size).reshape(size, *[1] * len(lanes))
-    eye = jnp.eye(size, dtype=matrix.dtype).reshape(size, size, *[1] * len(lanes))
-    least = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix) if floor is None else floor
-    if size > _UNDIVIDED:
-        half = size // 2
-        first = inverse_root(matrix[:half, :half], least[:half])
-        across = _times_transposed(matrix[half:, :half], first)
-        last = inverse_root(matrix[half:, half:] - _times_transposed(across, across), least[half:])
-        corner = -_times(last, _times(across, first))
-        zero = jnp.zeros((half, size - half, *lanes), matrix.dtype)
-        return jnp.concatenate([jnp.concatenate([first, zero], 1), jnp.concatenate([corner, last], 1)])
-
-    def eliminate(j: jax.Array, state: tuple) -> tuple:
-        left, root = state
-
-        @fenced
-        def scale(left: jax.Array) -> tuple:
-            inverse = jax.lax.rsqrt(jnp.maximum(left[j, j], least[j]))
-            return inverse, jnp.where(index > j, left[:, j], 0) * (inverse * inverse)
-
-        @fenced
-        def subtract(rows: jax.Array, inverse: jax.Array, shares: jax.Array) -> jax.Array:
-            return jnp.where((index == j)[:, None], rows * inverse, rows - shares[:, None] * rows[j])
-
-        inverse, shares = scale(left)
-        return subtract(left, inverse, shares), subtract(root, inverse, shares)
-
-    return repeat(size, eliminate, (matrix, jnp.broadcast_to(eye, matrix.shape)))[1]
-
-
-@fenced
-def _times(a: jax.Array, b: jax.Array) -> jax.Array:
-    """A B of matrices (r, c, *lanes) and (c, d, *lanes)."""
-    return each(lambda row: fold(jnp.add, [x * y for x, y in zip(row, b, strict=True)]), a)
-
-
-def _times_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
-    """A B' of matrices (r, c, *lanes) and (d, c, *lanes)."""
-    return _times(a, jnp.swapaxes(b, 0, 1))
 
 
 @dataclass(frozen=True)
@@ -291,7 +237,7 @@ class BlockProblem(ABC):
 
         matrix, v, inverse = reduce(blocks)
         border = _Border(inverse, v) if self.bordered else None
-        return Factors(blocks, inverse_root(complete(matrix, v, inverse)), weights, border)
+        return Factors(blocks, inverse_cholesky(complete(matrix, v, inverse)), weights, border)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
         """Orthogonalise [A, sigma] column by column, in the inner product that the weights give.

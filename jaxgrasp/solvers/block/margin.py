@@ -15,10 +15,10 @@ from jaxgrasp.solvers.block.kkt import (
     adjoint_rows,
     apply_rows,
     least,
-    spread_over,
     total,
 )
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
+from jaxgrasp.solvers.small_matrices import spread_over
 
 
 @jax.tree_util.register_dataclass

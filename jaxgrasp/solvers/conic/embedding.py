@@ -16,11 +16,17 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers.block.kkt import inverse_root
 from jaxgrasp.solvers.conic import cones
 from jaxgrasp.solvers.conic.cones import Scaling
-from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, Parts, inner, most, over_blocks, reduce
-from jaxgrasp.solvers.small_matrices import back, cholesky, down
+from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, Parts, inner, most, reduce
+from jaxgrasp.solvers.small_matrices import (
+    cholesky_3x3,
+    inverse_cholesky,
+    matvec,
+    solve_3x3,
+    solve_lower_3x3,
+    sum_over_blocks,
+)
 
 _MAX_ITERATIONS = 60
 _PATIENCE = 6
@@ -273,28 +279,28 @@ def _factor(problem: ConicMargin, scalings: tuple[Scaling, ...]) -> _Factors:
     @fenced
     def blocks(scalings: tuple[Scaling, ...]) -> tuple:
         grams = [part.gram(w) for part, w in zip(problem.rows, scalings, strict=True)]
-        lower = cholesky([fold(jnp.add, list(entries)) for entries in zip(*grams, strict=True)])
+        lower = cholesky_3x3([fold(jnp.add, list(entries)) for entries in zip(*grams, strict=True)])
         sigma = tuple(part.sigma for part in problem.rows)
         weighed = tuple(cones.weigh(w, v) for w, v in zip(scalings, sigma, strict=True))
-        return lower, back(lower, problem.adjoint(weighed)[0])
+        return lower, solve_3x3(lower, problem.adjoint(weighed)[0])
 
     lower, phi = blocks(scalings)
 
     @fenced
     def equalities(lower: list[jax.Array], phi: jax.Array) -> tuple:
-        reduced = down(lower, jnp.moveaxis(problem.columns, 1, 0))
+        reduced = solve_lower_3x3(lower, jnp.moveaxis(problem.columns, 1, 0))
         matrix = jnp.stack(
-            [over_blocks(jnp.swapaxes(reduced * reduced[:, r][:, None], 0, 1)) for r in range(len(problem.rhs))]
+            [sum_over_blocks(jnp.swapaxes(reduced * reduced[:, r][:, None], 0, 1)) for r in range(len(problem.rhs))]
         )
         eye = jnp.eye(len(problem.rhs), dtype=phi.dtype).reshape(*matrix.shape[:2], *[1] * (problem.rhs.ndim - 1))
         # What of sigma the blocks cannot make up for; as a difference of squares it would cancel.
         rest = [part.sigma - part.apply(phi) for part in problem.rows]
         lean = inner(*[[cones.shrink(w, v) for w, v in zip(scalings, rest, strict=True)]] * 2)
-        return matrix + eye * problem.dropped, problem.border - over_blocks(problem.columns * phi), lean
+        return matrix + eye * problem.dropped, problem.border - sum_over_blocks(problem.columns * phi), lean
 
     matrix, v, lean = equalities(lower, phi)
-    root = inverse_root(matrix)
-    half = fenced(_times)(root, v)
+    root = inverse_cholesky(matrix)
+    half = fenced(matvec)(root, v)
     pivot = lean + fold(jnp.add, half * half)
     return _Factors(lower, phi, root, v, pivot)
 
@@ -320,13 +326,13 @@ def _newton(
 
     @fenced
     def eliminate(right: jax.Array, right_lam: jax.Array, rhs_y: jax.Array) -> tuple:
-        first = back(factors.lower, right)
-        half = _times(factors.root, over_blocks(problem.columns * first) - rhs_y)
-        across = _times(factors.root, factors.v)
+        first = solve_3x3(factors.lower, right)
+        half = matvec(factors.root, sum_over_blocks(problem.columns * first) - rhs_y)
+        across = matvec(factors.root, factors.v)
         lam = right_lam - fold(jnp.add, fold(jnp.add, factors.phi * right)) - fold(jnp.add, across * half)
         lam = lam / jnp.maximum(factors.pivot, jnp.finfo(lam.dtype).tiny)
         y = fold(jnp.add, factors.root * (half + across * lam)[:, None])
-        x = first - factors.phi * lam - back(factors.lower, problem.pull_back(y))
+        x = first - factors.phi * lam - solve_3x3(factors.lower, problem.pull_back(y))
         return x, lam, y
 
     @fenced
@@ -352,10 +358,6 @@ def _newton(
     start = nothing, (*without_sides(rhs_x, rhs_lam, sides), rhs_y), none, none, sides
     (x, lam, y), _, lhs, z, _ = repeat(1 + _REFINEMENTS, improve, start)
     return x, lam, y, z, lhs
-
-
-def _times(matrix: jax.Array, v: jax.Array) -> jax.Array:
-    return fold(jnp.add, jnp.swapaxes(matrix, 0, 1) * v[:, None])
 
 
 def _total(state: _State) -> jax.Array:

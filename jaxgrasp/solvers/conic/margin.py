@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.solvers.block.kkt import spread_over
 from jaxgrasp.solvers.conic import cones
 from jaxgrasp.solvers.conic.cones import Scaling
+from jaxgrasp.solvers.small_matrices import matvec_transposed, spread_over, sum_over_blocks
 
 Parts = tuple[jax.Array, ...]
 # Axes up to this length are reduced term by term.
@@ -46,12 +46,12 @@ class ConeRows:
     def apply(self, x: jax.Array) -> jax.Array:
         """A x: (3, n, *lanes) -> (d, 1, n, *lanes), the same for all copies."""
         x = x if self.stretch is None else self.stretch * x
-        return fold(jnp.add, spread_over(self._matrix().T, x) * x[:, None])[:, None]
+        return matvec_transposed(spread_over(self._matrix().T, x), x)[:, None]
 
     def adjoint(self, z: jax.Array) -> jax.Array:
         """A'z summed over copies: (d, J, n, *lanes) -> (3, n, *lanes)."""
         z = along(jnp.add, jnp.moveaxis(z, 1, 0))
-        pulled = fold(jnp.add, spread_over(self._matrix(), z) * z[:, None])
+        pulled = matvec_transposed(spread_over(self._matrix(), z), z)
         return pulled if self.stretch is None else self.stretch * pulled
 
     def sides(self) -> jax.Array:
@@ -66,11 +66,11 @@ class ConeRows:
         if w.size is None:
             weights = along(jnp.add, jnp.moveaxis(1 / (w.point * w.point), 1, 0))
             table = literal(np.stack([rows[:, a] * rows[:, b] for a, b in pairs], 1), weights.dtype)
-            entries = list(fold(jnp.add, spread_over(table, weights) * weights[:, None]))
+            entries = list(matvec_transposed(spread_over(table, weights), weights))
         else:
             inverse = 1 / (w.size * w.size)
             turned = cones.reflected(w.point)
-            v = fold(jnp.add, spread_over(self._matrix(), turned) * turned[:, None])
+            v = matvec_transposed(spread_over(self._matrix(), turned), turned)
             signs = np.array([1.0] + [-1.0] * (rows.shape[0] - 1))
             bent = (rows * signs[:, None]).T @ rows
             total = along(jnp.add, inverse)
@@ -100,7 +100,7 @@ class ConicMargin:
 
     def equality(self, x: jax.Array, lam: jax.Array) -> jax.Array:
         """E x + w lambda."""
-        return over_blocks(self.columns * x) + self.border * lam
+        return sum_over_blocks(self.columns * x) + self.border * lam
 
     def pull_back(self, y: jax.Array) -> jax.Array:
         """E'y."""
@@ -131,11 +131,6 @@ class ConicPoint(NamedTuple):
     margin: jax.Array
     y: jax.Array
     z: Parts
-
-
-def over_blocks(x: jax.Array) -> jax.Array:
-    """Sum over components and blocks, (eq, 3, n, *lanes) -> (eq, *lanes)."""
-    return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(x, 1, 0)), 1, 0))
 
 
 def inner(a: Parts | list[jax.Array], b: Parts | list[jax.Array]) -> jax.Array:
