@@ -26,7 +26,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, xla
 
 from jaxgrasp.compiling import own_settings
-from jaxgrasp.lanes.independent import alike, independent, merged_axes, types
+from jaxgrasp.lanes.independent import independent, merge_axes, result_types, unify_types
 from jaxgrasp.lanes.tiles import LOOSE_TILE, run_in_tiles
 
 Tree = Any
@@ -126,7 +126,7 @@ _linear_lanes_p.multiple_results = True
 def _bind(spec: _Map, data: list, tangents: list) -> list:
     """Apply the map, as one operation of the program."""
     args = [*data, *tangents]
-    return _linear_lanes_p.bind(*alike(args, _shared(spec, len(args))), spec=spec)
+    return _linear_lanes_p.bind(*unify_types(args, _shared(spec, len(args))), spec=spec)
 
 
 def _split(spec: _Map, args: Any) -> tuple[list, list]:
@@ -147,7 +147,7 @@ def _run(*args: jax.Array, spec: _Map) -> list[jax.Array]:
 
 _linear_lanes_p.def_impl(partial(xla.apply_primitive, _linear_lanes_p))
 mlir.register_lowering(_linear_lanes_p, mlir.lower_fun(_run, multiple_results=True))
-_linear_lanes_p.def_abstract_eval(lambda *avals, spec: types(avals, _shared(spec, len(avals)), spec.outputs))
+_linear_lanes_p.def_abstract_eval(lambda *avals, spec: result_types(avals, _shared(spec, len(avals)), spec.outputs))
 
 
 def _shared(spec: _Map, count: int) -> tuple[bool, ...]:
@@ -226,7 +226,7 @@ def _transpose(cotangents: Any, *args: Any, spec: _Map) -> list:
 
 def _batch(args: Any, dims: Any, *, spec: _Map) -> tuple[list, list]:
     """Make a mapped axis part of the lanes."""
-    merged, still_shared, size, lanes = merged_axes(args, dims, _shared(spec, len(args)))
+    merged, still_shared, size, lanes = merge_axes(args, dims, _shared(spec, len(args)))
     count = len(spec.shared)
     out = _bind(spec._replace(shared=still_shared[:count]), merged[:count], merged[count:])
     return [x.reshape(size, lanes, *x.shape[1:]) for x in out], [0] * len(out)

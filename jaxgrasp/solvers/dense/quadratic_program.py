@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 
 from jaxgrasp.arrays import as_float, broadcast_batch
 from jaxgrasp.compiling import compiled
-from jaxgrasp.lanes.independent import automatically, one_lane
+from jaxgrasp.lanes.independent import one_lane, with_automatic_axes
 from jaxgrasp.records import record
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.dense.embedding import CONSTANTS, Embedding, Program, largest
@@ -242,7 +242,7 @@ def solve_qp(
 @partial(compiled, static_argnums=(0, 1))
 def _solve_lanes(shared: tuple[bool, ...], batch: tuple[int, ...], lanes: Program) -> QPSolution:
     solve = jax.vmap(lambda *data: _solve_one(Program(*data)), in_axes=tuple(None if alone else 0 for alone in shared))
-    solution = automatically(solve, lanes, shared)
+    solution = with_automatic_axes(solve, lanes, shared)
     return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solution)
 
 
