@@ -38,7 +38,7 @@ class Blocks(NamedTuple):
     sigma: (m, n, *lanes), the border column, >= 0; zero where absent.
     h: (m, n, *lanes), right-hand sides; one where absent.
     present: (n, *lanes), 1 or 0.
-    hessian: (k, k, n, *lanes), a root of H_i (H_i = root' root), for `EffortProblem`.
+    hessian_root: (k, k, n, *lanes), a root of H_i (H_i = root' root), for `EffortProblem`.
     start: (k,), where the unknowns of a block start.
     """
 
@@ -47,14 +47,14 @@ class Blocks(NamedTuple):
     sigma: jax.Array
     h: jax.Array
     present: jax.Array
-    hessian: jax.Array | None
+    hessian_root: jax.Array | None
     start: jax.Array
 
     @property
     def root(self) -> jax.Array:
-        """`hessian`, of blocks that have one."""
-        assert self.hessian is not None
-        return self.hessian
+        """`hessian_root`, of blocks that have one."""
+        assert self.hessian_root is not None
+        return self.hessian_root
 
 
 class Record(NamedTuple):
@@ -246,9 +246,9 @@ class BlockProblem(ABC):
         """
         k = g.patterns.shape[1]
         columns = [jnp.broadcast_to(spread_over(g.patterns[:, a], weights), weights.shape) for a in range(k)]
-        if g.hessian is not None:
-            columns = [jnp.concatenate([c, g.hessian[:, a]]) for a, c in enumerate(columns)]
-            weights = jnp.concatenate([weights, jnp.ones_like(g.hessian[:, 0])])
+        if g.hessian_root is not None:
+            columns = [jnp.concatenate([c, g.hessian_root[:, a]]) for a, c in enumerate(columns)]
+            weights = jnp.concatenate([weights, jnp.ones_like(g.hessian_root[:, 0])])
         if self.bordered:
             columns.append(g.sigma)
 

@@ -118,7 +118,7 @@ def solve_symmetric(problem: BlockProblem, s: Rows, z: Rows, right: tuple) -> tu
         out = []
         for g, x, row, e in zip(problem.groups, dx, dz, problem.pull_back(dy), strict=True):
             left = adjoint_rows(g, row * g.present) + e + (1 - g.present) * x
-            if g.hessian is not None:
+            if g.hessian_root is not None:
                 left = left + apply_hessian(g, x)
             out.append(left)
         rows = tuple(apply_rows(g, x) * g.present for g, x in zip(problem.groups, dx, strict=True))
