@@ -48,19 +48,6 @@ def row_basis(rows: jax.Array) -> Basis:
     longest = jnp.sqrt(fold(jnp.maximum, dot(rows, rows)))
     least = RANK_TOLERANCE[rows.dtype.name] * longest
 
-    # Of the last rows, bring the longest to the front, by exchanging neighbours from the end on.
-    @fenced
-    def longest_first(rows: jax.Array, operations: jax.Array) -> tuple[jax.Array, jax.Array]:
-        squares = list(dot(rows, rows))
-        for r in reversed(range(1, len(squares))):
-            longer = squares[r] > squares[r - 1]
-            squares[r - 1] = jnp.maximum(squares[r], squares[r - 1])
-            rows, operations = (
-                x.at[r - 1].set(jnp.where(longer, x[r], x[r - 1])).at[r].set(jnp.where(longer, x[r - 1], x[r]))
-                for x in (rows, operations)
-            )
-        return rows, operations
-
     # Scale row j to length 1, and remove it from the later ones.
     @fenced
     def remove(j: jax.Array, rows: jax.Array, operations: jax.Array, products: jax.Array) -> tuple:
@@ -83,7 +70,7 @@ def row_basis(rows: jax.Array) -> Basis:
     state = repeat(3, step, state)
     for j in (3, 4):
         rows, operations, lengths = state
-        first = longest_first(rows[j:6], operations[j:6])
+        first = _longest_first(rows[j:6], operations[j:6])
         rows, operations = rows.at[j:6].set(first[0]), operations.at[j:6].set(first[1])
         state = step(jnp.asarray(j), (rows, operations, lengths))
     rows, operations, lengths = repeat(count - 5, lambda i, state: step(i + 5, state), state)
@@ -105,6 +92,20 @@ def row_basis(rows: jax.Array) -> Basis:
 
     rows, operations = correct(correction(rows), rows, operations)
     return Basis(rows, operations, kept, lengths / jnp.where(longest > 0, longest, 1))
+
+
+@fenced
+def _longest_first(rows: jax.Array, operations: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Bring the longest of some rows to the front, by exchanging neighbours from the end on."""
+    squares = list(dot(rows, rows))
+    for r in reversed(range(1, len(squares))):
+        longer = squares[r] > squares[r - 1]
+        squares[r - 1] = jnp.maximum(squares[r], squares[r - 1])
+        rows, operations = (
+            x.at[r - 1].set(jnp.where(longer, x[r], x[r - 1])).at[r].set(jnp.where(longer, x[r - 1], x[r]))
+            for x in (rows, operations)
+        )
+    return rows, operations
 
 
 @jax.custom_jvp

@@ -222,7 +222,7 @@ def _predict_correct(
     """Take one step.
 
     A direction that aims at s z = a in every row has z ds + s dz = a - s z. With the weights w = z/s and the rows' own
-    equation ds = -r - A dx this is dz = e + w A dx, with the shift e = w r - z + a/s: all that `problem.solve` is told.
+    equation ds = -r - A dx this is dz = e + w A dx, with the shift e = w r - z + a/s, which `problem.solve` takes.
 
     Returns:
         The new iterate and its complementarity, NaN where the step is unusable.

@@ -1,7 +1,8 @@
 """Linear algebra of small matrices, one for every block or lane, in code that XLA's CPU backend vectorises over them.
 
-The entries of a matrix stand in the leading axes and whatever there is one matrix for (blocks, copies, lanes) in the
-trailing ones, so that every elementary operation runs over all of them. `jnp.linalg` would call LAPACK for each.
+The leading axes of an array are the rows and columns of a matrix; the trailing ones are blocks, copies and lanes, each
+with a matrix of its own, so that every elementary operation runs over all of these. `jnp.linalg` would call LAPACK for
+every single matrix.
 """
 
 import jax

@@ -153,31 +153,7 @@ class ArrowProblem:
     def factor(self, weights: jax.Array) -> _Factors:
         """Factor the Newton system: eliminate the copies' blocks, their equalities, then x_0."""
         eq, _, n = self.columns.shape[:3]
-
-        # Blocks of the copies: P_j, F_j, E P_j^-1 E' and E F_j; the hub: P_0 - sum_j H F_j.
-        @fenced
-        def blocks(weights: jax.Array) -> tuple:
-            pairs = [(a, b) for a in range(3) for b in range(a + 1)]
-            grams = [
-                fold(jnp.add, spread_over(self.patterns[:, a] * self.patterns[:, b], weights) * weights)
-                for a, b in pairs
-            ]
-            factors = cholesky_3x3(
-                [g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)]
-            )
-            follow = jnp.stack([solve_3x3(factors, self.copy_hessian[:, b]) for b in range(3)], 1)
-            solved = jnp.stack([solve_3x3(factors, self.columns[r]) for r in range(eq)])
-            matrix = jnp.stack([sum_over_blocks(self.columns * solved[r]) for r in range(eq)])
-            across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
-            full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(3) for b in range(3)]
-            hub = jnp.stack(full).reshape(3, 3, *full[0].shape)[:, :, :, -1:] + self.hub_hessian
-            # H - H P_j^-1 H of every copy, whose sum over the copies joins H_0 + A'W_0 A.
-            remainder = self.copy_hessian - fold(
-                jnp.add, jnp.moveaxis(self.copy_hessian[:, :, None] * follow[None], 1, 0)
-            )
-            return factors, follow, matrix, across, (hub + _sum_copies(remainder, 3))[:, :, :, 0]
-
-        factors, follow, matrix, across, hub = blocks(weights)
+        factors, follow, matrix, across, hub = fenced(self._eliminate_copies)(weights)
 
         # Equalities of the copies: G_j = L_j^-1 E F_j, and the sum of G_j'G_j for the hub.
         eye = jnp.eye(eq, dtype=weights.dtype).reshape(eq, eq, *[1] * (self.rhs.ndim - 1))
@@ -213,6 +189,24 @@ class ArrowProblem:
             turned,
             weights,
         )
+
+    def _eliminate_copies(self, weights: jax.Array) -> tuple:
+        """Compute factors of P_j, F_j, E P_j^-1 E' and E F_j of the copies, and the blocks of P_0 - sum_j H F_j."""
+        eq = len(self.columns)
+        pairs = [(a, b) for a in range(3) for b in range(a + 1)]
+        grams = [
+            fold(jnp.add, spread_over(self.patterns[:, a] * self.patterns[:, b], weights) * weights) for a, b in pairs
+        ]
+        factors = cholesky_3x3([g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
+        follow = jnp.stack([solve_3x3(factors, self.copy_hessian[:, b]) for b in range(3)], 1)
+        solved = jnp.stack([solve_3x3(factors, self.columns[r]) for r in range(eq)])
+        matrix = jnp.stack([sum_over_blocks(self.columns * solved[r]) for r in range(eq)])
+        across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
+        full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(3) for b in range(3)]
+        hub = jnp.stack(full).reshape(3, 3, *full[0].shape)[:, :, :, -1:] + self.hub_hessian
+        # H - H P_j^-1 H of every copy, whose sum over the copies joins H_0 + A'W_0 A.
+        remainder = self.copy_hessian - fold(jnp.add, jnp.moveaxis(self.copy_hessian[:, :, None] * follow[None], 1, 0))
+        return factors, follow, matrix, across, (hub + _sum_copies(remainder, 3))[:, :, :, 0]
 
     def solve(self, factors: _Factors, residuals: Residuals, shift: jax.Array) -> tuple:
         """Solve the Newton system with dz = shift + weights * A dx for the directions (dx, dy, A dx)."""

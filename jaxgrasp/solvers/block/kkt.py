@@ -88,7 +88,7 @@ class Record(NamedTuple):
 
 
 class _BlockFactor(NamedTuple):
-    """The Cholesky factor L of P, and what is solved with it; lists run over the k unknowns of a block."""
+    """The Cholesky factor L of P, and solutions with it; lists run over the k unknowns of a block."""
 
     below: list[jax.Array]  # L10, L20, L21, each (n, *lanes)
     inverse: list[jax.Array]  # 1 / diag(L), each (n, *lanes)
@@ -301,7 +301,7 @@ class BlockProblem(ABC):
             components.append(along)
         below = [components[j][i - j - 1] for i in range(k) for j in range(i)]
         theta = [along[-1] for along in components] if self.bordered else []
-        # Only sigma is left, and its square is kappa.
+        # The remaining column is sigma's, and its square is kappa.
         kappa = fenced(lambda w, c: fold(jnp.add, w * c * c))(weights, columns[0]) if self.bordered else None
         reduced = fenced(lambda below, inverse: _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
         return _BlockFactor(below, inverse, reduced(below, inverse), theta, kappa)

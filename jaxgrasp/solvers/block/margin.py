@@ -160,7 +160,7 @@ class MarginProblem(BlockProblem):
         value = fold(jnp.add, [total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
         value = value + fold(jnp.add, iterate.y * self.rhs)
         best = jnp.maximum(lower, record.lower)
-        # Where nothing is attained yet, the bound holds for lambda >= 0; a negative one excludes these, no more.
+        # Before any point attains a lambda, the bound holds for lambda >= 0 only; a negative bound just excludes these.
         radius = 1 + self.radius * jnp.where(jnp.isinf(best), 0, jnp.maximum(0, -best))
         scale = 1 / pull
         upper = jnp.where(pull > 0, (value + radius * loss) * scale, jnp.inf)
