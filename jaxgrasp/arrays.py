@@ -17,15 +17,15 @@ from jaxgrasp.compiling import by_size, compiled
 
 
 def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | str, ...]) -> jax.Array:
-    """An array in JAX's floating precision whose trailing axes are `event`.
+    """Convert to an array in JAX's floating precision and check that its trailing axes are `event`.
 
     Args:
         name: the argument's name, for the error.
-        value: what the caller gave.
-        event: wanted trailing shape; a string stands for any size.
+        value: the caller's argument.
+        event: the trailing shape that is wanted; a string stands for any size.
 
     Raises:
-        ValueError: not real numbers, or another trailing shape.
+        ValueError: the value has no real numbers, or another trailing shape.
     """
     process.check()
     try:
@@ -44,14 +44,17 @@ def as_float(name: str, value: ArrayLike | Sequence[float], event: tuple[int | s
 
 
 def placed(value: ArrayLike | Sequence[float]) -> jax.Array:
-    """`jnp.asarray`, which compiles a program for every shape of a NumPy array, where nothing need be compiled."""
+    """Convert to an array of JAX as `jnp.asarray` does, but compile nothing.
+
+    `jnp.asarray` compiles a program for every shape of a NumPy array.
+    """
     if type(value) is np.ndarray and jax.sharding.get_abstract_mesh().empty:
         return jax.device_put(value)
     return jnp.asarray(value)
 
 
 def literal(values: np.ndarray, dtype: jnp.dtype) -> jax.Array:
-    """A small constant array spelt out in the program.
+    """Write a small constant array into the program, entry by entry.
 
     JAX would hand a NumPy array to the compiled program as one more argument.
     """
@@ -61,10 +64,10 @@ def literal(values: np.ndarray, dtype: jnp.dtype) -> jax.Array:
 
 
 def broadcast_batch(**batches: tuple[int, ...]) -> tuple[int, ...]:
-    """The common batch shape of several arguments.
+    """Find the common batch shape of several arguments.
 
     Raises:
-        ValueError: shapes that do not broadcast, with the name of each argument.
+        ValueError: the shapes do not broadcast; the message names each argument.
     """
     try:
         return jnp.broadcast_shapes(*batches.values())
@@ -76,14 +79,14 @@ def broadcast_batch(**batches: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
-    """Quotient, and 0 (with gradient 0) where the denominator is 0."""
+    """Divide, with quotient 0 and gradient 0 where the denominator is 0."""
     positive = denominator != 0
-    # Double where: the gradient of the branch not taken would be NaN.
+    # The inner where keeps the division finite: else the gradient of the branch not taken would be NaN.
     return jnp.where(positive, numerator / jnp.where(positive, denominator, 1), 0)
 
 
 def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
-    """Euclidean norm whose gradient at 0 is 0."""
+    """Compute the Euclidean norm, with gradient 0 at 0."""
     # Not a reduction: XLA's CPU backend hands large ones to a library, which a tile cannot call.
     squares = fold(jnp.add, jnp.moveaxis(x * x, axis, 0))
     positive = squares > 0
@@ -92,7 +95,7 @@ def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
 
 @partial(compiled, pace=by_size)
 def frames_from_normals(normals: jax.Array) -> jax.Array:
-    """Contact frames (t1, t2, n) of unit normals: the x and y axes turned by the smallest rotation that takes z to n.
+    """Make contact frames (t1, t2, n): the x and y axes turned by the smallest rotation that takes z to n.
 
     The rule is smooth but at n = -z, where it is the half turn about y. Margins of coarse friction pyramids depend on
     the tangents, so give frames of your own where these matter.
@@ -105,7 +108,7 @@ def frames_from_normals(normals: jax.Array) -> jax.Array:
     """
     largest = jnp.max(jnp.abs(normals), -1, keepdims=True)
     usable = (largest > 0) & jnp.isfinite(largest)
-    # Others become z, and NaN at the end alone: derivatives would carry it to everything.
+    # Unusable normals become z here and NaN only at the end: derivatives would carry NaN to every lane.
     safe = jnp.where(usable, normals, jnp.array([0, 0, 1], normals.dtype))
     # Dividing by the largest entry first keeps tiny and huge normals from under- and overflowing.
     scaled = safe / jax.lax.stop_gradient(jnp.where(usable, largest, 1))
@@ -125,7 +128,7 @@ def frames_from_normals(normals: jax.Array) -> jax.Array:
 def fold(op: Callable[[jax.Array, jax.Array], jax.Array], parts: Iterable[jax.Array]) -> jax.Array:
     """Combine arrays, or the entries along a leading axis, with a binary operation, pairwise.
 
-    Spelt out, where a reduction would do: XLA's CPU code for it then runs along the trailing lanes, in full vectors.
+    This unrolls the reduction, so that XLA's CPU code for it runs along the trailing lanes, in full vectors.
     """
     parts = list(parts)
     while len(parts) > 1:
@@ -134,7 +137,7 @@ def fold(op: Callable[[jax.Array, jax.Array], jax.Array], parts: Iterable[jax.Ar
 
 
 def fold_last(op: Callable[[jax.Array, jax.Array], jax.Array], x: jax.Array, axes: int = 1) -> jax.Array:
-    """`fold` along the last axes of x, which are short: XLA's CPU code then makes one loop of it and what is around."""
+    """Apply `fold` along the last axes of x, which are short: XLA's CPU backend fuses it with its surroundings."""
     for _ in range(axes):
         x = fold(op, [x[..., k] for k in range(x.shape[-1])])
     return x

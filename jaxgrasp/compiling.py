@@ -1,4 +1,4 @@
-"""Compiling for CPUs: what XLA is told about whole programs, so that they are ready sooner and run faster."""
+"""Options of XLA for whole programs on CPUs, so that they are ready sooner and run faster."""
 
 import contextlib
 import functools
@@ -11,22 +11,22 @@ from jax.core import Tracer
 
 from jaxgrasp import process
 
-# Internals of XLA. Loops over lanes are vectors already as XLA writes them: LLVM's costlier passes take long and gain
-# nothing, while the widest registers, which LLVM is shy of, do.
+# These are internals of XLA. XLA already vectorises loops over lanes, so LLVM's costlier passes take long and gain
+# nothing; the widest registers, which LLVM avoids by default, do gain.
 _FAST = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
-# The older of XLA's two ways to loops: programs are ready in a third of the time and keep a tenth of the memory, which
-# counts where every shape has one. What XLA computes for long is up to half slower so.
+# The older of XLA's two emitters of loops: programs are ready in a third of the time and keep a tenth of the memory,
+# which counts where every shape has its own program. Long computations of XLA are up to half slower so.
 _BRIEF = _FAST | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
-# Ready in half of that time again, and several times slower: for a few lanes.
+# Programs are ready in half of that time again, and run several times slower: for a few lanes.
 _SOON = _BRIEF | {"xla_backend_optimization_level": 0}
-# Numbers in arguments, for which the time to compile counts alone.
-_LITTLE = 1 << 14
+# With at most this many numbers in its arguments, only the time to compile a program counts.
+_FEW_NUMBERS = 1 << 14
 _PACES = {"fast": (_FAST,), "brief": (_BRIEF, _FAST), "soon": (_SOON, _FAST)}
 
 
 @contextlib.contextmanager
 def own_settings() -> Iterator[None]:
-    """What is traced inside is this library's own, whatever a user of JAX asks of code of his."""
+    """Trace with this library's settings of JAX, whatever the user's settings for code of their own."""
     with jax.numpy_rank_promotion("allow"), jax.disable_jit(False):
         yield
 
@@ -34,14 +34,14 @@ def own_settings() -> Iterator[None]:
 def compiled(
     function: Callable[..., Any], static_argnums: tuple[int, ...] = (), pace: Callable[..., str] = lambda *_: "fast"
 ) -> Callable[..., Any]:
-    """`jax.jit` with the options that suit this library's kernels, where it is the outermost one.
+    """Apply `jax.jit` with the options that suit this library's kernels, where it is the outermost one.
 
     JAX takes options for whole programs only: inside somebody's transformation theirs apply.
 
     Args:
-        function: to be compiled.
+        function: the function to compile.
         static_argnums: as `jax.jit` takes them.
-        pace: what a call with these arguments should be compiled for, see `options`.
+        pace: takes the arguments of a call and returns the pace to compile it for, see `options`.
     """
     inner = jax.jit(function, static_argnums=static_argnums)
 
@@ -57,7 +57,7 @@ def compiled(
             traced = any(isinstance(x, Tracer) for x in (jnp.zeros(()), *jax.tree.leaves(args)))
             if traced:
                 return inner(*args)
-            # NaN and infinity are answers here.
+            # NaN and infinity are results here, not errors.
             with jax.debug_nans(False), jax.debug_infs(False):
                 return outer(pace(*args))(*args)
 
@@ -65,13 +65,13 @@ def compiled(
 
 
 def by_size(*args: Any) -> str:
-    """The pace of programs that touch every number once."""
-    return "soon" if sum(jnp.size(x) for x in jax.tree.leaves(args)) <= _LITTLE else "brief"
+    """Choose the pace of a program that touches every number once."""
+    return "soon" if sum(jnp.size(x) for x in jax.tree.leaves(args)) <= _FEW_NUMBERS else "brief"
 
 
 @functools.cache
 def options(pace: str = "fast") -> dict[str, Any] | None:
-    """`compiler_options` for `jax.jit`; None on other than CPUs, and where XLA no longer knows them.
+    """Find `compiler_options` for `jax.jit`: None on other than CPUs, and where XLA no longer knows them.
 
     Args:
         pace: "fast" runs fast; "brief" is for programs in which XLA computes little, "soon" for those of a few lanes.

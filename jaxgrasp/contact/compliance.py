@@ -14,13 +14,14 @@ from jaxgrasp.records import record
 
 @record
 class Compliance:
-    """One compliance Q_j for each disturbance vertex; a single Q for all is given as a plain array instead."""
+    """One compliance Q_j for each disturbance vertex; a plain array stands for a single Q for all."""
 
     per_vertex: Float[Array, "..."]
+    """The matrices Q_j, (*batch, n_d, n_c, 3, 3) or (*batch, n_d, 3 n_c, 3 n_c), contact frames, m/N."""
 
     @classmethod
     def per_direction(cls, matrices: ArrayLike) -> "Compliance":
-        """Compliances, one for each disturbance vertex.
+        """Make one compliance for each disturbance vertex.
 
         They go with `DisturbanceSet.vertices` alone, in the order of its wrenches: a support function needs one
         pseudo-inverse.
@@ -36,15 +37,15 @@ class Compliance:
 
 
 def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array | None, jax.Array]:
-    """M with M M' = Q^-1, lanes trailing, and whether Q is symmetric positive definite.
+    """Compute M with M M' = Q^-1, lanes trailing, and whether Q is symmetric positive definite.
 
     Args:
         compliance: None for Q = I; blocks (n, 3, 3, *lanes) or full (3 n, 3 n, *lanes).
         contacts: n.
 
     Returns:
-        blocks (n, 3, 3, *lanes) or full (3 n, 3 n, *lanes), the identity where Q is not sound, None for Q = I; and
-        bool (*lanes).
+        M, blocks (n, 3, 3, *lanes) or full (3 n, 3 n, *lanes): the identity where Q is not usable, None for Q = I; and
+        bool (*lanes), whether Q is usable.
     """
     if compliance is None:
         return None, jnp.array(True)
@@ -53,35 +54,38 @@ def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array
     matrices = jnp.moveaxis(compliance, axes, (-2, -1))
     skew = jnp.abs(matrices - jnp.swapaxes(matrices, -1, -2)).max((-2, -1))
     symmetric = skew <= 1e-5 * jnp.abs(matrices).max((-2, -1))
-    half, positive = _inverse_root(matrices)
-    sound = symmetric & positive
-    half = jnp.where(sound[..., None, None], half, jnp.eye(half.shape[-1], dtype=half.dtype))
-    return jnp.moveaxis(half, (-2, -1), axes), sound if full else sound.all(0)
+    root, positive = _inverse_root(matrices)
+    usable = symmetric & positive
+    root = jnp.where(usable[..., None, None], root, jnp.eye(root.shape[-1], dtype=root.dtype))
+    return jnp.moveaxis(root, (-2, -1), axes), usable if full else usable.all(0)
 
 
 @jax.custom_jvp
 def _inverse_root(matrices: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """M with M M' = Q^-1 for Q (..., k, k), and whether Q is positive definite; the identity where it is not."""
+    """Compute M with M M' = Q^-1 for Q (..., k, k), the identity where Q is not positive definite, and where it is."""
     lower = jnp.linalg.cholesky(matrices, symmetrize_input=True)
-    sound = jnp.isfinite(lower).all((-2, -1))
+    usable = jnp.isfinite(lower).all((-2, -1))
     eye = jnp.broadcast_to(jnp.eye(matrices.shape[-1], dtype=matrices.dtype), matrices.shape)
-    lower = jnp.where(sound[..., None, None], lower, eye)
-    return jnp.swapaxes(jax.scipy.linalg.solve_triangular(lower, eye, lower=True), -1, -2), sound
+    lower = jnp.where(usable[..., None, None], lower, eye)
+    return jnp.swapaxes(jax.scipy.linalg.solve_triangular(lower, eye, lower=True), -1, -2), usable
 
 
 @_inverse_root.defjvp
 def _inverse_root_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """DM = -1/2 M M' dQ M: then d(M M') = -Q^-1 dQ Q^-1, and only M M' matters."""
+    """Return dM = -1/2 M M' dQ M: then d(M M') = -Q^-1 dQ Q^-1, and only M M' matters."""
     (change,) = tangents
-    half, sound = _inverse_root(*primals)
-    change = jnp.where(sound[..., None, None], change + jnp.swapaxes(change, -1, -2), 0)
-    moved = -0.25 * half @ (jnp.swapaxes(half, -1, -2) @ change @ half)
-    return (half, sound), (moved, np.zeros(sound.shape, jax.dtypes.float0))
+    root, usable = _inverse_root(*primals)
+    change = jnp.where(usable[..., None, None], change + jnp.swapaxes(change, -1, -2), 0)
+    moved = -0.25 * root @ (jnp.swapaxes(root, -1, -2) @ change @ root)
+    return (root, usable), (moved, np.zeros(usable.shape, jax.dtypes.float0))
 
 
 @jax.custom_jvp
 def _inverse(rows: jax.Array) -> tuple[jax.Array, Basis]:
-    """N^+ (3, 6, n, *lanes) of N (6, 3, n, *lanes), and the basis B = T N of its rows."""
+    """Compute N^+ (3, 6, n, *lanes) of N (6, 3, n, *lanes), and the basis B = T N of its rows.
+
+    B has orthonormal rows, so N^+ = B'T.
+    """
     basis = row_basis(rows)
 
     @fenced
@@ -95,7 +99,7 @@ def _inverse(rows: jax.Array) -> tuple[jax.Array, Basis]:
 
 @_inverse.defjvp
 def _inverse_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """While the rank stays: dN^+ = V - N^+ (N V + dN N^+) with V = dN' K and K = N^+' N^+ = (N N')^+."""
+    """Return dN^+ = V - N^+ (N V + dN N^+) with V = dN' K and K = N^+' N^+ = (N N')^+, while the rank stays."""
     (rows,), (change,) = primals, tangents
     inverse, basis = _inverse(rows)
 
@@ -117,87 +121,96 @@ def _inverse_jvp(primals: tuple, tangents: tuple) -> tuple:
     return (inverse, basis), (assemble(inverse, *turn(rows, change, inverse)), still)
 
 
-def pseudo_inverse(columns: jax.Array, half: jax.Array | None) -> tuple[jax.Array, Basis]:
-    """G* = Q^-1 G' (G Q^-1 G')^+ (15), on the range of G; lanes trail.
+def pseudo_inverse(columns: jax.Array, root: jax.Array | None) -> tuple[jax.Array, Basis]:
+    """Compute G* = Q^-1 G' (G Q^-1 G')^+ (15), on the range of G; lanes trail.
+
+    With M M' = Q^-1 and N = G M it is G* = M N^+.
 
     Args:
-        columns: (6, 3, n, *lanes), blocks of G, zero where absent.
-        half: from `inverse_root`.
+        columns: blocks of G, (6, 3, n, *lanes), zero where a contact is absent.
+        root: M from `inverse_root`.
 
     Returns:
-        (3, 6, n, *lanes), blocks of G*, and the basis of the rows of G.
+        Blocks of G*, (3, 6, n, *lanes), and the basis of the rows of N.
     """
-    inverse, basis = _inverse(_times_half(columns, half))
-    if half is None:
+    inverse, basis = _inverse(_times_root(columns, root))
+    if root is None:
         return inverse, basis
-    return jnp.swapaxes(_half_times(jnp.swapaxes(inverse, 0, 1), half), 0, 1), basis
+    return jnp.swapaxes(_root_times(jnp.swapaxes(inverse, 0, 1), root), 0, 1), basis
 
 
 def pseudo_inverse_adjoint(
-    columns: jax.Array, half: jax.Array | None, pulled: jax.Array
+    columns: jax.Array, root: jax.Array | None, pulled: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """The transpose of the derivative of G*, while the rank stays.
+    """Apply the transpose of the derivative of G*, while the rank stays.
 
     With G* = M N^+, N = G M, and the cotangent P of N^+: that of N is K (P' - X'N) - X N^+' with X = N^+'P and
     K = N^+'N^+.
 
     Args:
-        columns: (6, 3, n, *lanes).
-        half: M, see `inverse_root`.
-        pulled: (6, 3, n, *lanes), cotangents of the blocks of G*.
+        columns: blocks of G, (6, 3, n, *lanes).
+        root: M from `inverse_root`.
+        pulled: cotangents of the blocks of G*, (6, 3, n, *lanes).
 
     Returns:
-        Cotangents of columns and of M.
+        Cotangents of columns and of M (None for Q = I).
     """
-    rows = columns if half is None else _times_half(columns, half)
+    rows = columns if root is None else _times_root(columns, root)
     inverse = jnp.swapaxes(_inverse(rows)[0], 0, 1)
-    own = pulled if half is None else _half_times(pulled, _swapped(half, columns.shape[2]))
+    # The cotangent P of N^+, as rows.
+    cotangent = pulled if root is None else _root_times(pulled, _transposed(root, columns.shape[2]))
 
+    # X = N^+'P and K.
     @fenced
-    def products(inverse: jax.Array, own: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return each(lambda i: (dot(own, i), dot(inverse, i)), inverse)
+    def products(inverse: jax.Array, cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return each(lambda i: (dot(cotangent, i), dot(inverse, i)), inverse)
 
+    # K (P' - X'N) - X N^+'.
     @fenced
-    def combine(cross: jax.Array, gram: jax.Array, rows: jax.Array, inverse: jax.Array, own: jax.Array) -> jax.Array:
-        left = jnp.swapaxes(cross, 0, 1)
-        rest = own - each(lambda x: fold(jnp.add, [r * x_r for r, x_r in zip(rows, x, strict=True)]), left)
+    def combine(
+        cross: jax.Array, gram: jax.Array, rows: jax.Array, inverse: jax.Array, cotangent: jax.Array
+    ) -> jax.Array:
+        crossed = jnp.swapaxes(cross, 0, 1)
+        rest = cotangent - each(lambda x: fold(jnp.add, [r * x_r for r, x_r in zip(rows, x, strict=True)]), crossed)
         pair = lambda k: fold(jnp.add, [v * k_r - i * x_r for v, i, k_r, x_r in zip(rest, inverse, *k, strict=True)])
         return each(pair, (gram, cross))
 
-    back = combine(*products(inverse, own), rows, inverse, own)
-    if half is None:
+    back = combine(*products(inverse, cotangent), rows, inverse, cotangent)
+    if root is None:
         return back, None
-    pull = jax.vjp(lambda columns, half: (_times_half(columns, half), _half_times(inverse, half)), columns, half)[1]
+    # G and M also enter by N = G M and by the last product, M N^+.
+    pull = jax.vjp(lambda columns, root: (_times_root(columns, root), _root_times(inverse, root)), columns, root)[1]
     return pull((back, pulled))
 
 
-def _swapped(half: jax.Array, contacts: int) -> jax.Array:
-    """M'."""
-    return jnp.swapaxes(half, 0, 1) if half.shape[:2] == (3 * contacts,) * 2 else jnp.swapaxes(half, 1, 2)
+def _transposed(root: jax.Array, contacts: int) -> jax.Array:
+    """Transpose M, of blocks or full."""
+    return jnp.swapaxes(root, 0, 1) if root.shape[:2] == (3 * contacts,) * 2 else jnp.swapaxes(root, 1, 2)
 
 
-def _times_half(columns: jax.Array, half: jax.Array | None) -> jax.Array:
-    """G M, (6, 3, n, *lanes)."""
-    if half is None:
+def _times_root(columns: jax.Array, root: jax.Array | None) -> jax.Array:
+    """Compute G M, (6, 3, n, *lanes)."""
+    if root is None:
         return columns
-    if half.shape[:2] != (3 * columns.shape[2],) * 2:
-        return jnp.einsum("rcn...,nca...->ran...", columns, half)
-    tall = jnp.einsum("rp...,pq...->rq...", _flatten(columns), half)
+    if root.shape[:2] != (3 * columns.shape[2],) * 2:
+        return jnp.einsum("rcn...,nca...->ran...", columns, root)
+    tall = jnp.einsum("rp...,pq...->rq...", _flatten(columns), root)
     return _unflatten(tall)
 
 
-def _half_times(rows: jax.Array, half: jax.Array) -> jax.Array:
-    """M q for every row q, (6, 3, n, *lanes)."""
-    if half.shape[:2] != (3 * rows.shape[2],) * 2:
-        return jnp.einsum("nac...,rcn...->ran...", half, rows)
-    return _unflatten(jnp.einsum("pq...,rq...->rp...", half, _flatten(rows)))
+def _root_times(rows: jax.Array, root: jax.Array) -> jax.Array:
+    """Compute M q for every row q, (6, 3, n, *lanes)."""
+    if root.shape[:2] != (3 * rows.shape[2],) * 2:
+        return jnp.einsum("nac...,rcn...->ran...", root, rows)
+    return _unflatten(jnp.einsum("pq...,rq...->rp...", root, _flatten(rows)))
 
 
 def _flatten(blocks: jax.Array) -> jax.Array:
-    """(6, 3, n, *lanes) -> (6, 3 n, *lanes), contact by contact."""
+    """Reshape (6, 3, n, *lanes) to (6, 3 n, *lanes), contact by contact."""
     swapped = jnp.swapaxes(blocks, 1, 2)
     return swapped.reshape(blocks.shape[0], -1, *blocks.shape[3:])
 
 
 def _unflatten(rows: jax.Array) -> jax.Array:
+    """Reshape (6, 3 n, *lanes) to (6, 3, n, *lanes)."""
     return jnp.swapaxes(rows.reshape(rows.shape[0], -1, 3, *rows.shape[2:]), 1, 2)

@@ -1,7 +1,7 @@
 """Direct calls: all arrays are known, on the default CPU, and nobody transforms the call.
 
-NumPy can then lay them out, and nothing is compiled for it; and a batch can be filled up to a size for which there is a
-program already.
+NumPy can then lay the arrays out, and nothing is compiled for that; and a batch can be filled up to a size for which
+there is a program already.
 """
 
 from collections.abc import Iterable
@@ -25,21 +25,21 @@ def is_direct(leaves: Iterable[Any]) -> bool:
 
 
 def power_of_two(count: int, least: int) -> int:
-    """The smallest power of two that is not below the count, nor below another one."""
+    """Find the smallest power of two that is at least `count` and at least `least`, a power of two."""
     return max(least, 1 << max(count - 1, 0).bit_length())
 
 
 def filled(x: jax.Array | np.ndarray, size: int) -> jax.Array:
-    """An array (count, ...) with copies of its last entry up to (size, ...)."""
-    own = np.asarray(x)
-    if len(own) == size:
+    """Fill an array (count, ...) up to (size, ...) with copies of its last entry."""
+    values = np.asarray(x)
+    if len(values) == size:
         return jax.device_put(x)
-    more = np.empty((size, *own.shape[1:]), own.dtype)
-    more[: len(own)] = own
-    more[len(own) :] = own[-1]
-    return jax.device_put(more)
+    padded = np.empty((size, *values.shape[1:]), values.dtype)
+    padded[: len(values)] = values
+    padded[len(values) :] = values[-1]
+    return jax.device_put(padded)
 
 
 def cut(tree: Tree, count: int) -> Tree:
-    """Leaves (size, ...) without what they were filled with."""
+    """Cut leaves (size, ...) to the (count, ...) that they were before `filled`."""
     return jax.tree.map(lambda x: x if len(x) == count else jax.device_put(np.asarray(x)[:count]), tree)

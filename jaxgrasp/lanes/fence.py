@@ -1,4 +1,4 @@
-"""Keeping XLA's CPU backend from computing the same thing many times.
+"""Fences keep XLA's CPU backend from computing the same thing many times.
 
 XLA's CPU fusion copies a cheap producer into every consumer. In a long chain of small dense algebra that multiplies
 the work (and the compile time) tenfold, and `lax.optimization_barrier` is gone before fusion runs. A call that is
@@ -25,7 +25,7 @@ _loops = contextvars.ContextVar("loops", default=False)
 
 @contextlib.contextmanager
 def fences(on: bool) -> Iterator[None]:
-    """Whether `fenced` functions traced inside become functions of their own; worth it on CPUs alone."""
+    """Choose whether `fenced` functions traced inside become functions of their own; that is worth it on CPUs alone."""
     token = _fences.set(on)
     try:
         yield
@@ -35,7 +35,7 @@ def fences(on: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def loops() -> Iterator[None]:
-    """Without fences, but with loops as loops: for compilers that choose themselves which to spell out."""
+    """Trace without fences and keep loops as loops, for compilers that choose themselves which to unroll."""
     tokens = _fences.set(False), _loops.set(True)
     try:
         yield
@@ -61,9 +61,9 @@ def fenced(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
-    """`step(i, state)` for i = 0 .. count - 1.
+    """Apply `step(i, state)` for i = 0 .. count - 1.
 
-    A loop where fences are on, since code size is compile time there; else spelt out, for fusion.
+    This is a loop where fences are on, since code size is compile time there; else it is unrolled, for fusion.
     """
     if count == 1:
         return step(jnp.asarray(0), state)
@@ -71,8 +71,8 @@ def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
 
 
 def each(function: Callable[[T], U], parts: T) -> U:
-    """`function` of every entry along the leading axis, stacked.
+    """Apply a function to every entry along the leading axis and stack the results.
 
-    One after the other where fences are on, else all at once.
+    The entries are worked on one after the other where fences are on, else all at once.
     """
     return jax.lax.map(function, parts) if _fences.get() else jax.vmap(function)(parts)

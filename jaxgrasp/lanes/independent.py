@@ -2,13 +2,13 @@
 
 A plain element-wise function of JAX works wherever it is put: in a sharded program every device computes its part, in
 `jax.shard_map` a result varies over the axes over which its arguments do, a program for another platform gets that
-platform's code. What a function of lanes is made of (loops over tiles, compiled kernels) offers none of that by
-itself. `independent` binds one to a primitive with these rules:
+platform's code. The parts of a function of lanes (loops over tiles, compiled kernels) offer none of that by themselves.
+`independent` binds such a function to a primitive with these rules:
 
     types        a result has the lanes' sharding and varies like the arguments, which are made alike first
     mapped axes  become lanes
-    devices      each computes its own lanes, and nothing is sent; what is inside sees arrays of one device
-    platforms    the function is told for which it is traced
+    devices      each computes its own lanes, and nothing is sent; the function sees arrays of one device
+    platforms    the function is called with the platform for which it is traced
 """
 
 import contextlib
@@ -30,15 +30,15 @@ from jaxgrasp.kernels import allowed
 
 Tree = Any
 Events = tuple[tuple[tuple[int, ...], Any], ...]
-# Of the leaves, which all lanes share, and of the platform.
+# Takes the leaves, for each whether all lanes share it, and the platform.
 Function = Callable[[list[jax.Array], tuple[bool, ...], str], list[jax.Array]]
 
 
 def independent(function: Function, leaves: Sequence[jax.Array], shared: tuple[bool, ...], out: Events) -> list:
-    """Run a function of lanes.
+    """Run a function of lanes that have nothing to do with each other.
 
     Args:
-        function: of a list like `leaves`, of `shared`, which `jax.vmap` may have changed, and of the platform ("cpu",
+        function: takes a list like `leaves`, `shared`, which `jax.vmap` may have changed, and the platform ("cpu",
             "cuda" or "other"); returns leaves (lanes, ...).
         leaves: (lanes, ...), or without the leading axis where shared.
         shared: for every leaf, whether it is the same for all lanes.
@@ -47,17 +47,17 @@ def independent(function: Function, leaves: Sequence[jax.Array], shared: tuple[b
     Returns:
         Leaves (lanes, ...).
     """
-    given = alike(leaves, shared)
+    operands = unify_types(leaves, shared)
     devices = _needs_devices() if allowed() else None
-    return _independent_p.bind(*given, function=function, shared=shared, out=out, devices=devices)
+    return _independent_p.bind(*operands, function=function, shared=shared, out=out, devices=devices)
 
 
 def one_lane(function: Callable[..., Tree], active: jax.Array, *arguments: Tree) -> Tree:
-    """Run a function of one lane as `independent`; mapped by `jax.vmap`, it is one of many lanes.
+    """Run a function of one lane as `independent`; `jax.vmap` makes it one of many lanes.
 
     Args:
-        function: takes `active` and the other arguments; it is not differentiated.
-        active: a scalar, which every lane has for itself.
+        function: takes `active` and the other arguments; it has no derivative.
+        active: a scalar, of which every lane has its own.
         arguments: trees of arrays.
     """
     leaves, structure = jax.tree.flatten((active, *arguments))
@@ -71,77 +71,81 @@ def one_lane(function: Callable[..., Tree], active: jax.Array, *arguments: Tree)
 
     with on_one_device():
         like = jax.eval_shape(at, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves])
-    wanted, structure_out = jax.tree.flatten(like)
+    outputs, structure_out = jax.tree.flatten(like)
     shared = (False,) + (True,) * (len(leaves) - 1)
-    out = independent(run, [leaves[0][None], *leaves[1:]], shared, tuple((x.shape, x.dtype) for x in wanted))
+    out = independent(run, [leaves[0][None], *leaves[1:]], shared, tuple((x.shape, x.dtype) for x in outputs))
     return jax.tree.unflatten(structure_out, [x[0] for x in out])
 
 
 @contextlib.contextmanager
 def on_one_device() -> Iterator[None]:
-    """What is traced inside knows of no mesh."""
+    """Trace what is inside as a program of one device, without a mesh."""
     with jax.sharding.use_abstract_mesh(AbstractMesh((), ())), own_settings():
         yield
 
 
-def alike(leaves: Sequence[jax.Array], shared: Sequence[bool]) -> list[jax.Array]:
-    """The leaves with the same varying axes and the same sharding of the lanes, as JAX's own operations have them."""
+def unify_types(leaves: Sequence[jax.Array], shared: Sequence[bool]) -> list[jax.Array]:
+    """Give all leaves the same varying axes and the same sharding of the lanes, as JAX's own operations do."""
     leaves = [jnp.asarray(x) for x in leaves]
+    # Inside `jax.shard_map`: let every leaf vary over the axes over which any of them does.
     varying = [jax.typeof(x).manual_axis_type.varying for x in leaves]
-    every = frozenset().union(*varying)
-    for i, own in enumerate(varying):
-        if every - own:
-            leaves[i] = jax.lax.pcast(leaves[i], tuple(sorted(every - own)), to="varying")
-    if not any(_explicit(x) for x in leaves):
+    union = frozenset().union(*varying)
+    for i, axes in enumerate(varying):
+        if union - axes:
+            leaves[i] = jax.lax.pcast(leaves[i], tuple(sorted(union - axes)), to="varying")
+    # On a mesh with explicit axes: divide all leaves as the first one that is divided.
+    if not any(_has_explicit_axes(x) for x in leaves):
         return leaves
     lead = next((s for s in (_lead(x) for x, s in zip(leaves, shared, strict=True) if not s) if s is not None), None)
-    wanted = [_spread(None if s else lead, x.ndim) for x, s in zip(leaves, shared, strict=True)]
+    specs = [_lane_spec(None if s else lead, x.ndim) for x, s in zip(leaves, shared, strict=True)]
     return [
-        x if not _explicit(x) and not tuple(filter(None, spec)) or jax.typeof(x).sharding.spec == spec
+        x if not _has_explicit_axes(x) and not tuple(filter(None, spec)) or jax.typeof(x).sharding.spec == spec
         else jax.sharding.reshard(x, spec)
-        for x, spec in zip(leaves, wanted, strict=True)
+        for x, spec in zip(leaves, specs, strict=True)
     ]  # fmt: skip
 
 
-def automatically(function: Callable[..., Tree], leaves: Sequence[jax.Array], shared: Sequence[bool]) -> Tree:
-    """A function of lanes, of which JAX need not know how each operation inside is divided.
+def with_automatic_axes(function: Callable[..., Tree], leaves: Sequence[jax.Array], shared: Sequence[bool]) -> Tree:
+    """Call a function of lanes and let XLA choose how each operation inside is divided over devices.
 
     Args:
-        function: of the leaves; returns leaves (lanes, ...).
+        function: takes the leaves; returns leaves (lanes, ...).
         leaves: (lanes, ...), or without the leading axis where shared.
-        shared: for every leaf.
+        shared: for every leaf, whether it is the same for all lanes.
     """
-    given = alike(leaves, shared)
-    own = next((x for x, s in zip(given, shared, strict=True) if not s), None)
-    if own is None or not _explicit(own):
-        return function(*given)
-    with jax.sharding.use_abstract_mesh(jax.typeof(own).sharding.mesh):
-        return jax.sharding.auto_axes(function, out_sharding=PartitionSpec(_lead(own)))(*given)
+    operands = unify_types(leaves, shared)
+    batched = next((x for x, s in zip(operands, shared, strict=True) if not s), None)
+    if batched is None or not _has_explicit_axes(batched):
+        return function(*operands)
+    with jax.sharding.use_abstract_mesh(jax.typeof(batched).sharding.mesh):
+        return jax.sharding.auto_axes(function, out_sharding=PartitionSpec(_lead(batched)))(*operands)
 
 
-def _explicit(x: jax.Array) -> bool:
+def _has_explicit_axes(x: jax.Array) -> bool:
+    """True if the array lies on a mesh whose sharding JAX tracks in types."""
     return AxisType.Explicit in jax.typeof(x).sharding.mesh.axis_types
 
 
 def _lead(x: jax.Array) -> Any:
-    """Over which axes of the mesh the lanes are divided."""
+    """Read the axes of the mesh over which the lanes are divided."""
     return jax.typeof(x).sharding.spec[0]
 
 
-def _spread(lead: Any, ndim: int) -> PartitionSpec:
+def _lane_spec(lead: Any, ndim: int) -> PartitionSpec:
+    """Divide the leading axis over `lead`, and no other axis."""
     return PartitionSpec(*([lead, *[None] * (ndim - 1)] if ndim else []))
 
 
-def types(avals: Sequence[Any], shared: Sequence[bool], out: Events) -> list:
-    """The types of results that have the lanes of arguments which are `alike`."""
-    own = next(a for a, s in zip(avals, shared, strict=True) if not s)
-    lead = own.sharding.spec[0]
+def result_types(avals: Sequence[Any], shared: Sequence[bool], out: Events) -> list:
+    """Make the types of results with the lanes of arguments whose types `unify_types` made the same."""
+    batched = next(a for a, s in zip(avals, shared, strict=True) if not s)
+    lead = batched.sharding.spec[0]
     return [
         ShapedArray(
-            (own.shape[0], *shape),
+            (batched.shape[0], *shape),
             dtype,
-            sharding=own.sharding.update(spec=_spread(lead, len(shape) + 1)),
-            manual_axis_type=own.manual_axis_type,
+            sharding=batched.sharding.update(spec=_lane_spec(lead, len(shape) + 1)),
+            manual_axis_type=batched.manual_axis_type,
         )
         for shape, dtype in out
     ]
@@ -150,10 +154,12 @@ def types(avals: Sequence[Any], shared: Sequence[bool], out: Events) -> list:
 _independent_p = Primitive("independent")
 _independent_p.multiple_results = True
 _independent_p.def_impl(partial(xla.apply_primitive, _independent_p))
-_independent_p.def_abstract_eval(lambda *avals, shared, out, **_: types(avals, shared, out))
+_independent_p.def_abstract_eval(lambda *avals, shared, out, **_: result_types(avals, shared, out))
 
 
 def _lower(ctx: Any, *leaves: Any, function: Function, shared: Any, out: Events, devices: Any, platform: str) -> Any:
+    """Lower the function for one platform, with a rule for XLA's partitioner where XLA divides the program."""
+
     def run(*leaves: jax.Array) -> list[jax.Array]:
         with on_one_device():
             return function(list(leaves), shared, platform)
@@ -162,33 +168,33 @@ def _lower(ctx: Any, *leaves: Any, function: Function, shared: Any, out: Events,
     inside = ctx.replace(avals_in=plain(ctx.avals_in), avals_out=plain(ctx.avals_out))
     divided = devices is not None and _is_divided(ctx.module_context.axis_context)
     with on_one_device():
-        lowered = mlir.lower_fun(_divided(run, shared, inside) if divided else run, multiple_results=True)
+        lowered = mlir.lower_fun(_partitionable(run, shared, inside) if divided else run, multiple_results=True)
         return lowered(inside, *leaves)
 
 
 def _is_divided(context: Any) -> bool:
-    """Whether XLA divides this program over devices: not where it has one, nor inside `jax.shard_map`."""
+    """True if XLA divides this program over devices: it has several, and this is not inside `jax.shard_map`."""
     return getattr(context, "num_devices", 1) > 1 and getattr(context, "abstract_mesh", None) is not None
 
 
-def _divided(run: Callable, shared: tuple[bool, ...], ctx: Any) -> Callable:
-    """The function with its rule for XLA's partitioner: lanes may be divided, nothing else."""
+def _partitionable(run: Callable, shared: tuple[bool, ...], ctx: Any) -> Callable:
+    """Give the function its rule for XLA's partitioner: lanes may be divided, no other axis."""
     names = iter(range(10_000))
     others: list[str] = []
 
     def mapping(ndim: int, has_lanes: bool) -> ArrayMapping:
-        own = [f"d{next(names)}" for _ in range(ndim - has_lanes)]
-        others.extend(own)
-        return ArrayMapping(*["lanes"] * has_lanes, *own)
+        axes = [f"d{next(names)}" for _ in range(ndim - has_lanes)]
+        others.extend(axes)
+        return ArrayMapping(*["lanes"] * has_lanes, *axes)
 
     operands = tuple(mapping(len(a.shape), not s) for a, s in zip(ctx.avals_in, shared, strict=True))
     results = tuple(mapping(len(a.shape), True) for a in ctx.avals_out)
     rule = SdyShardingRule(operands, results, need_replication_factors=tuple(others))
 
-    def partition(mesh: Any, given: tuple, wanted: list) -> tuple:
-        lead = next(x.sharding.spec[0] for x, s in zip(given, shared, strict=True) if not s)
-        place = lambda x, s: NamedSharding(mesh, _spread(None if s else lead, len(x.shape)))
-        return mesh, run, [place(x, False) for x in wanted], tuple(map(place, given, shared))
+    def partition(mesh: Any, operands: tuple, results: list) -> tuple:
+        lead = next(x.sharding.spec[0] for x, s in zip(operands, shared, strict=True) if not s)
+        place = lambda x, s: NamedSharding(mesh, _lane_spec(None if s else lead, len(x.shape)))
+        return mesh, run, [place(x, False) for x in results], tuple(map(place, operands, shared))
 
     divided = custom_partitioning(run)
     divided.def_partition(partition, sharding_rule=rule)
@@ -201,23 +207,28 @@ for _name in ("cpu", "cuda"):
 
 
 def _batch(args: Any, dims: Any, *, shared: Any, **params: Any) -> tuple[list, list]:
-    merged, still, size, lanes = merged_axes(args, dims, shared)
-    out = _independent_p.bind(*alike(merged, still), shared=still, **params)
+    """Make a mapped axis part of the lanes."""
+    merged, still_shared, size, lanes = merge_axes(args, dims, shared)
+    out = _independent_p.bind(*unify_types(merged, still_shared), shared=still_shared, **params)
     return [x.reshape(size, lanes, *x.shape[1:]) for x in out], [0] * len(out)
 
 
 batching.primitive_batchers[_independent_p] = _batch
 
 
-def merged_axes(
+def merge_axes(
     args: Sequence[jax.Array], dims: Sequence[int | None], shared: Sequence[bool]
 ) -> tuple[list[jax.Array], tuple[bool, ...], int, int]:
-    """Leaves with a mapped axis made part of the lanes, what is then still shared, the axis' size and the lanes before.
+    """Make a mapped axis part of the lanes.
 
     Args:
-        args: the leaves, with lanes leading, but for the mapped axis, where not shared.
+        args: the leaves; where not shared, the lanes lead, but for the mapped axis.
         dims: for every leaf, where the mapped axis is; None where it has none.
-        shared: for every leaf.
+        shared: for every leaf, whether it is the same for all lanes.
+
+    Returns:
+        The leaves (size * lanes, ...), for every leaf whether it is still shared, the size of the mapped axis and the
+        number of lanes before.
     """
     size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
     front = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(args, dims, strict=True)]
@@ -237,8 +248,11 @@ def merged_axes(
 
 @functools.cache
 def _needs_devices() -> Any:
-    """An operation for whose sake JAX lowers a program with its devices known, as partitioning needs them."""
-    some = custom_partitioning(lambda x: x)
-    some.def_partition(None, sharding_rule="i -> i")
+    """Make a parameter that has JAX lower a program with its devices known, as partitioning needs them.
+
+    JAX looks for partitioned operations in the parameters of a program's operations; this is a jaxpr with one.
+    """
+    identity = custom_partitioning(lambda x: x)
+    identity.def_partition(None, sharding_rule="i -> i")
     with on_one_device():
-        return jax.make_jaxpr(some)(jax.ShapeDtypeStruct((1,), bool))
+        return jax.make_jaxpr(identity)(jax.ShapeDtypeStruct((1,), bool))

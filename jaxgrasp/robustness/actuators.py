@@ -59,7 +59,7 @@ class EffortRows(NamedTuple):
             sigma=self.sigma,
             h=self.h,
             present=jnp.ones_like(self.unit),
-            hessian=None,
+            hessian_root=None,
             start=literal(np.zeros(1), self.h.dtype),
         )
 

@@ -1,16 +1,20 @@
-"""The one primal-dual interior-point loop: Mehrotra's predictor-corrector over a batch of lanes.
+"""The primal-dual interior-point loop for linear rows: Mehrotra's predictor-corrector over a batch of lanes.
 
 A problem says what its unknowns are and how to solve its Newton system; the loop owns step lengths, centring, freezing
 of finished lanes and the stopping rule. All arrays carry the batch in their trailing axes ("lanes"), so that one lane
 is one problem and every elementwise operation works on a full vector of problems; with no trailing axis the same code
-is the program of a single problem.
+is the program of a single problem. Programs with second-order cones have a loop of their own, `conic.embedding`.
 
-The problems have the form: minimise over x subject to E x = b and A x + s = h, s >= 0, with multipliers y and z >= 0.
+The problems have the form: minimise f(x) over x subject to E x = b and A x + s = h, s >= 0, with multipliers y and
+z >= 0. The loop follows the points with
+
+    grad f(x) + A'z + E'y = 0,    E x = b,    A x + s = h,    s_i z_i = mu        for mu -> 0.
 
 Source: Mehrotra (1992), "On the implementation of a primal-dual interior point method"; the step rule and the freezing
 are described in `solve`.
 """
 
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -24,15 +28,15 @@ Tree = Any
 
 
 class Settings(NamedTuple):
-    """Numbers of the loop. All may be traced: changing them costs no recompilation, but for `equal_steps`.
+    """Numbers of the loop. All but those marked static may be traced: changing them costs no recompilation.
 
-    tolerance: stop at upper - lower <= tolerance * the problem's gap_scale.
-    max_iterations: steps at most.
-    step_cap: how close to the boundary a step may end, 1 - step_cap at most when mu is large.
-    mu_floor: smallest complementarity that is aimed at.
-    equal_steps: one step length for primal and dual unknowns (static).
-    safeguard: keep s >= safeguard * mu / z and z >= safeguard * mu / s after a step (static; 0.0 switches it off).
-    patience: steps in a row that may fail to cut the gap by a tenth.
+    tolerance: the loop stops at upper - lower <= tolerance * the problem's gap_scale.
+    max_iterations: the largest number of steps.
+    step_cap: a step goes at most max(0.99, 1 - step_cap) of the way to the boundary.
+    mu_floor: the smallest complementarity that a step aims at.
+    equal_steps: whether primal and dual unknowns take one step length (static).
+    safeguard: keeps s z >= safeguard * mu in every row after a step (static; 0.0 switches it off).
+    patience: how many steps in a row may fail to cut the gap by a tenth.
     gap_floor: gaps up to this one count as closed, whatever their scale; the loop then ends near a central point.
     gap_share: no step aims at less than this share of the wanted gap (static): nearer to the boundary rounding spoils
         the Newton system, and with it the stationarity that the bounds need.
@@ -50,7 +54,7 @@ class Settings(NamedTuple):
 
 
 class Iterate(NamedTuple):
-    """Unknowns; every leaf has trailing lane axes. `s` and `z` are trees of rows, alike in structure."""
+    """The unknowns; every leaf has trailing lane axes. `s` and `z` are trees of rows, alike in structure."""
 
     x: Tree
     y: Tree
@@ -59,7 +63,7 @@ class Iterate(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """What the optimality conditions lack: `dual` like x, `primal` like y, `rows` = A x + s - h like s."""
+    """Residuals of the optimality conditions: `dual` like x, `primal` like y, `rows` = A x + s - h like s."""
 
     dual: Tree
     primal: Tree
@@ -67,54 +71,54 @@ class Residuals(NamedTuple):
 
 
 class Problem(Protocol):
-    """What the loop asks of a problem. `lanes` is the shape of the batch."""
+    """The interface between a problem and the loop."""
 
     @property
     def lanes(self) -> tuple[int, ...]:
-        """Shape of the trailing axes."""
+        """The shape of the trailing axes."""
         ...
 
     @property
     def present(self) -> Tree:
-        """Like s, broadcastable: 1 where a row counts, 0 where it belongs to something absent."""
+        """A mask that broadcasts to s: 1 where a row counts, 0 where it belongs to something absent."""
         ...
 
     def start(self) -> Iterate:
-        """The first iterate, s > 0; z > 0 on rows that count and exactly 0 on the others."""
+        """Choose the first iterate, s > 0; z > 0 on rows that count and exactly 0 on the others."""
         ...
 
     def residuals(self, iterate: Iterate) -> Residuals:
-        """Residuals of the optimality conditions."""
+        """Compute the residuals of the optimality conditions."""
         ...
 
     def factor(self, weights: Tree) -> Any:
-        """Factorisation of the Newton system for weights z/s (like s)."""
+        """Factor the Newton system for weights z/s (like s)."""
         ...
 
     @property
     def predictor(self) -> "Problem":
-        """The problem with no more care for rounding than a direction needs that only tells how far a step can go."""
+        """The problem for the predictor, whose direction only tells how far a step can go and need not be exact."""
         ...
 
     def solve(self, factors: Any, residuals: Residuals, shift: Tree) -> tuple[Tree, Tree, Tree]:
-        """Directions (dx, dy, A dx) of the Newton system whose multiplier rows read dz = shift + weights * A dx."""
+        """Solve the Newton system with dz = shift + weights * A dx for the directions (dx, dy, A dx)."""
         ...
 
     def first_record(self) -> Any:
-        """The record before the first step; has `lower` and `upper`, certified bounds per lane."""
+        """Make the record before the first step; it has `lower` and `upper`, certified bounds per lane."""
         ...
 
     def gap_scale(self, record: Any) -> jax.Array:
-        """What gaps are measured by, per lane."""
+        """Compute the scale of gaps, per lane: `Settings.tolerance` is relative to it."""
         ...
 
     def assess(self, iterate: Iterate, residuals: Residuals, record: Any) -> Any:
-        """The record with this iterate taken into account; bounds only ever get better."""
+        """Update the record with this iterate; bounds only ever get better."""
         ...
 
 
 class Outcome(NamedTuple):
-    """What the loop leaves behind; `iterations` are the steps each lane took."""
+    """The last iterate of every lane with its residuals, its record and the number of steps that it took."""
 
     iterate: Iterate
     residuals: Residuals
@@ -142,12 +146,13 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
     then it freezes: nothing of it changes any more, whatever its neighbours do. A step that is not finite is not taken.
 
     Args:
-        problem: what to solve.
+        problem: the problem to solve.
         settings: numbers of the loop.
-        active: bool (*lanes); lanes that are False are not touched.
+        active: bool (*lanes); the loop does not touch lanes that are False.
     """
-    lanes = len(problem.lanes)
-    present = problem.present
+    lanes, present = len(problem.lanes), problem.present
+
+    # Start: mu is the mean of s z over the rows that count.
     iterate = fenced(problem.start)()
     count = reduce_rows(jnp.add, jax.tree.map(lambda p, s: jnp.broadcast_to(p, s.shape), present, iterate.s), lanes)
     inverse_count = 1 / jnp.maximum(count, 1)
@@ -157,17 +162,21 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         return (carry.step < settings.max_iterations) & jnp.any(carry.active)
 
     def body(carry: _Carry) -> _Carry:
-        least = settings.mu_floor
+        # Take a step, where it is finite.
+        least_aim = settings.mu_floor
         if settings.gap_share:
-            wanted = settings.gap_share * settings.tolerance * problem.gap_scale(carry.record)
-            least = jnp.maximum(least, wanted * inverse_count)
+            # On the central path the gap is the sum of s z, mu times the number of rows.
+            gap_aim = settings.gap_share * settings.tolerance * problem.gap_scale(carry.record)
+            least_aim = jnp.maximum(least_aim, gap_aim * inverse_count)
         stepped, mu = _predict_correct(
-            problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count, least
+            problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count, least_aim
         )
         active = carry.active
         take = active & jnp.isfinite(mu)
         iterate = _where(take, stepped, carry.iterate)
         residuals = fenced(problem.residuals)(iterate)
+
+        # Bound the optimum, and freeze the lanes whose bounds have met or no longer move.
         record = _where(active, fenced(problem.assess)(iterate, residuals, carry.record), carry.record)
         gap = record.upper - record.lower
         improved = gap < 0.9 * carry.best_gap
@@ -208,87 +217,143 @@ def _predict_correct(
     residuals: Residuals,
     mu: jax.Array,
     inverse_count: jax.Array,
-    least: float | jax.Array,
+    least_aim: float | jax.Array,
 ) -> tuple[Iterate, jax.Array]:
-    """One step; returns the new iterate and its complementarity, NaN where the step is unusable."""
+    """Take one step.
+
+    A direction that aims at s z = a in every row has z ds + s dz = a - s z. With the weights w = z/s and the rows' own
+    equation ds = -r - A dx this is dz = e + w A dx, with the shift e = w r - z + a/s, which `problem.solve` takes.
+
+    Returns:
+        The new iterate and its complementarity, NaN where the step is unusable.
+    """
     lanes, present = len(problem.lanes), problem.present
 
-    @fenced
-    def weigh(s: Tree, z: Tree, rows: Tree) -> tuple[Tree, ...]:
-        # One division serves weights and both ratio tests; absent rows (z = 0) divide by 1 instead of 0.
-        guarded = jax.tree.map(lambda z, p: z + (1 - p), z, present)
-        inverse = jax.tree.map(lambda s, g: 1 / (s * g), s, guarded)
-        inverse_s = jax.tree.map(jnp.multiply, guarded, inverse)
-        inverse_z = jax.tree.map(jnp.multiply, s, inverse)
-        weights = jax.tree.map(jnp.multiply, z, inverse_s)
-        return inverse_s, inverse_z, weights, jax.tree.map(lambda z, w, r: w * r - z, z, weights, rows)
-
-    inverse_s, inverse_z, weights, affine_shift = weigh(iterate.s, iterate.z, residuals.rows)
+    # Factor the Newton system, which both directions share.
+    inverse_s, inverse_z, weights, affine_shift = fenced(partial(_weigh, present))(iterate.s, iterate.z, residuals.rows)
     factors = problem.factor(weights)
 
-    @fenced
-    def towards_optimum(
-        z: Tree, rows: Tree, weights: Tree, lacking: Tree, inverse_s: Tree
-    ) -> tuple[Tree, Tree, jax.Array, jax.Array]:
-        """The affine ds and dz, and the reciprocals of the steps that reach the boundary; dz / z is -1 - ds / s."""
-        ds = jax.tree.map(lambda r, a: -r - a, lacking, rows)
-        dz = jax.tree.map(lambda z, w, d: -(z + w * d), z, weights, ds)
-        relative = jax.tree.map(jnp.multiply, ds, inverse_s)
-        primal, dual = -reduce_rows(jnp.minimum, relative, lanes), 1 + reduce_rows(jnp.maximum, relative, lanes)
-        if settings.equal_steps:
-            primal = dual = jnp.maximum(primal, dual)
-        return ds, dz, primal, dual
-
-    @fenced
-    def blocking(rows: Tree, shift: Tree, weights: Tree, lacking: Tree, inverse_s: Tree, inverse_z: Tree) -> tuple:
-        """ds, dz and the reciprocals of the steps that reach the boundary."""
-        ds = jax.tree.map(lambda r, a: -r - a, lacking, rows)
-        dz = jax.tree.map(lambda e, w, a: e + w * a, shift, weights, rows)
-        primal = -reduce_rows(jnp.minimum, jax.tree.map(jnp.multiply, ds, inverse_s), lanes)
-        dual = -reduce_rows(jnp.minimum, jax.tree.map(jnp.multiply, dz, inverse_z), lanes)
-        if settings.equal_steps:
-            primal = dual = jnp.maximum(primal, dual)
-        return ds, dz, primal, dual
-
-    @fenced
-    def correct(iterate: Iterate, ds: Tree, dz: Tree, primal: jax.Array, dual: jax.Array, mu: jax.Array) -> Tree:
-        """The corrector's shift: aim at sigma mu and make up for the second-order term ds dz."""
-        primal, dual = 1 / jnp.maximum(primal, 1), 1 / jnp.maximum(dual, 1)
-        # The mean of (s + primal ds) (z + dual dz), of which s z + z ds + s dz is zero.
-        along = inverse_count * _product(iterate.z, ds, lanes)
-        across = inverse_count * _product(ds, dz, lanes)
-        ratio = ((1 - dual) * mu + (primal - dual) * along + primal * dual * across) / mu
-        aim = jnp.maximum(ratio * ratio * ratio * mu, least)
-        return jax.tree.map(
-            lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, ds, dz, inverse_s, present
-        )
-
-    @fenced
-    def advance(iterate: Iterate, step: Iterate, primal: jax.Array, dual: jax.Array, mu: jax.Array) -> tuple:
-        eta = jnp.maximum(0.99, 1 - jnp.maximum(mu, settings.step_cap))
-        primal, dual = eta / jnp.maximum(primal, eta), eta / jnp.maximum(dual, eta)
-        new = Iterate(
-            x=_axpy(primal, step.x, iterate.x),
-            y=_axpy(dual, step.y, iterate.y),
-            s=_axpy(primal, step.s, iterate.s),
-            z=_axpy(dual, step.z, iterate.z),
-        )
-        mu_new = _product(new.s, new.z, lanes) * inverse_count
-        if settings.safeguard:
-            low = settings.safeguard * mu_new
-            guarded = jax.tree.map(lambda z, p: z + (1 - p), new.z, present)
-            raised = jax.tree.map(lambda s, g, p: low * p / (s * g), new.s, guarded, present)
-            kept_s = jax.tree.map(lambda s, r: s * jnp.maximum(1, r), new.s, raised)
-            kept_z = jax.tree.map(lambda z, r: z * jnp.maximum(1, r), new.z, raised)
-            new = new._replace(s=kept_s, z=kept_z)
-        return new, mu_new
-
+    # Predictor, a = 0: how far it can go tells how much centring is needed.
     _, _, rows = problem.predictor.solve(factors, residuals, affine_shift)
-    affine = towards_optimum(iterate.z, rows, weights, residuals.rows, inverse_s)
-    shift = correct(iterate, *affine, mu)
+    ds, dz, primal, dual = fenced(partial(_affine_direction, settings, lanes))(
+        iterate.z, rows, weights, residuals.rows, inverse_s
+    )
+
+    # Corrector, a = sigma mu - ds dz, with the predictor's ds and dz.
+    correct = partial(_correct, affine_shift, inverse_s, present, inverse_count, least_aim, lanes)
+    shift = fenced(correct)(iterate, ds, dz, primal, dual, mu)
     dx, dy, rows = problem.solve(factors, residuals, shift)
-    ds, dz, primal, dual = blocking(rows, shift, weights, residuals.rows, inverse_s, inverse_z)
-    return advance(iterate, Iterate(dx, dy, ds, dz), primal, dual, mu)
+
+    # Step, almost to the boundary.
+    ds, dz, primal, dual = fenced(partial(_test_ratios, settings, lanes))(
+        rows, shift, weights, residuals.rows, inverse_s, inverse_z
+    )
+    advance = partial(_advance, settings, present, inverse_count, lanes)
+    return fenced(advance)(iterate, Iterate(dx, dy, ds, dz), primal, dual, mu)
+
+
+def _weigh(present: Tree, s: Tree, z: Tree, rows: Tree) -> tuple[Tree, Tree, Tree, Tree]:
+    """Compute 1/s, 1/z, the weights z/s, and the shift that aims at s z = 0."""
+    # One division serves weights and both ratio tests; absent rows (z = 0) divide by 1 instead of 0.
+    guarded = jax.tree.map(lambda z, p: z + (1 - p), z, present)
+    inverse = jax.tree.map(lambda s, g: 1 / (s * g), s, guarded)
+    inverse_s = jax.tree.map(jnp.multiply, guarded, inverse)
+    inverse_z = jax.tree.map(jnp.multiply, s, inverse)
+    weights = jax.tree.map(jnp.multiply, z, inverse_s)
+    return inverse_s, inverse_z, weights, jax.tree.map(lambda z, w, r: w * r - z, z, weights, rows)
+
+
+def _affine_direction(
+    settings: Settings, lanes: int, z: Tree, rows: Tree, weights: Tree, residual: Tree, inverse_s: Tree
+) -> tuple[Tree, Tree, jax.Array, jax.Array]:
+    """Compute the predictor's ds and dz, and the reciprocals of the steps that reach the boundary.
+
+    As s z = 0 is aimed at, dz / z = -1 - ds / s, so the ratios of ds / s tell both steps.
+    """
+    ds = jax.tree.map(lambda r, a: -r - a, residual, rows)
+    dz = jax.tree.map(lambda z, w, d: -(z + w * d), z, weights, ds)
+    relative = jax.tree.map(jnp.multiply, ds, inverse_s)
+    primal, dual = -reduce_rows(jnp.minimum, relative, lanes), 1 + reduce_rows(jnp.maximum, relative, lanes)
+    if settings.equal_steps:
+        primal = dual = jnp.maximum(primal, dual)
+    return ds, dz, primal, dual
+
+
+def _correct(
+    affine_shift: Tree,
+    inverse_s: Tree,
+    present: Tree,
+    inverse_count: jax.Array,
+    least_aim: float | jax.Array,
+    lanes: int,
+    iterate: Iterate,
+    ds: Tree,
+    dz: Tree,
+    primal: jax.Array,
+    dual: jax.Array,
+    mu: jax.Array,
+) -> Tree:
+    """Compute the corrector's shift: aim at sigma mu and make up for the second-order term ds dz."""
+    primal, dual = 1 / jnp.maximum(primal, 1), 1 / jnp.maximum(dual, 1)
+    # mu_aff, the mean of (s + primal ds) (z + dual dz), of which s z + z ds + s dz is zero.
+    along = inverse_count * _product(iterate.z, ds, lanes)
+    across = inverse_count * _product(ds, dz, lanes)
+    ratio = ((1 - dual) * mu + (primal - dual) * along + primal * dual * across) / mu
+    # sigma mu with Mehrotra's sigma = (mu_aff / mu)^3.
+    aim = jnp.maximum(ratio * ratio * ratio * mu, least_aim)
+    return jax.tree.map(lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, ds, dz, inverse_s, present)
+
+
+def _test_ratios(
+    settings: Settings,
+    lanes: int,
+    rows: Tree,
+    shift: Tree,
+    weights: Tree,
+    residual: Tree,
+    inverse_s: Tree,
+    inverse_z: Tree,
+) -> tuple[Tree, Tree, jax.Array, jax.Array]:
+    """Compute the corrector's ds and dz, and the reciprocals of the steps that reach the boundary."""
+    ds = jax.tree.map(lambda r, a: -r - a, residual, rows)
+    dz = jax.tree.map(lambda e, w, a: e + w * a, shift, weights, rows)
+    primal = -reduce_rows(jnp.minimum, jax.tree.map(jnp.multiply, ds, inverse_s), lanes)
+    dual = -reduce_rows(jnp.minimum, jax.tree.map(jnp.multiply, dz, inverse_z), lanes)
+    if settings.equal_steps:
+        primal = dual = jnp.maximum(primal, dual)
+    return ds, dz, primal, dual
+
+
+def _advance(
+    settings: Settings,
+    present: Tree,
+    inverse_count: jax.Array,
+    lanes: int,
+    iterate: Iterate,
+    step: Iterate,
+    primal: jax.Array,
+    dual: jax.Array,
+    mu: jax.Array,
+) -> tuple[Iterate, jax.Array]:
+    """Go max(0.99, 1 - max(mu, step_cap)) of the way to the boundary; returns the iterate and its complementarity."""
+    eta = jnp.maximum(0.99, 1 - jnp.maximum(mu, settings.step_cap))
+    primal, dual = eta / jnp.maximum(primal, eta), eta / jnp.maximum(dual, eta)
+    new = Iterate(
+        x=_axpy(primal, step.x, iterate.x),
+        y=_axpy(dual, step.y, iterate.y),
+        s=_axpy(primal, step.s, iterate.s),
+        z=_axpy(dual, step.z, iterate.z),
+    )
+    mu_new = _product(new.s, new.z, lanes) * inverse_count
+    if settings.safeguard:
+        # Raise both to s z >= safeguard mu, so that no row runs ahead of the others to the boundary.
+        low = settings.safeguard * mu_new
+        guarded = jax.tree.map(lambda z, p: z + (1 - p), new.z, present)
+        lift = jax.tree.map(lambda s, g, p: low * p / (s * g), new.s, guarded, present)
+        lifted_s = jax.tree.map(lambda s, r: s * jnp.maximum(1, r), new.s, lift)
+        lifted_z = jax.tree.map(lambda z, r: z * jnp.maximum(1, r), new.z, lift)
+        new = new._replace(s=lifted_s, z=lifted_z)
+    return new, mu_new
 
 
 def _axpy(step: jax.Array, direction: Tree, point: Tree) -> Tree:

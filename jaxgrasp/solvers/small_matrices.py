@@ -1,12 +1,106 @@
-"""Symmetric positive definite matrices of three rows, one for each block, spelt out; anything trails."""
+"""Linear algebra of small matrices, one for every block or lane, in code that XLA's CPU backend vectorises over them.
+
+The leading axes of an array are the rows and columns of a matrix; the trailing ones are blocks, copies and lanes, each
+with a matrix of its own, so that every elementary operation runs over all of these. `jnp.linalg` would call LAPACK for
+every single matrix.
+"""
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxgrasp.arrays import fold
+from jaxgrasp.lanes.fence import each, fenced, repeat
 
-def cholesky(entries: list[jax.Array]) -> list[jax.Array]:
-    """1/L00, L10, 1/L11, L20, L21, 1/L22 of a 3x3 matrix given by 00, 10, 11, 20, 21, 22; pivots are clamped."""
+# `inverse_cholesky` eliminates matrices up to this size row by row, and cuts larger ones in two.
+_LARGEST_UNCUT = 16
+
+
+def spread_over(values: jax.Array, like: jax.Array) -> jax.Array:
+    """Append axes to constants, so that they weigh arrays of which `like` is one along its leading axis."""
+    return values.reshape(values.shape + (1,) * (like.ndim - 1))
+
+
+def matvec(matrix: jax.Array, v: jax.Array) -> jax.Array:
+    """Compute M v of M (r, c, ...) and v (c, ...)."""
+    return fold(jnp.add, jnp.swapaxes(matrix, 0, 1) * v[:, None])
+
+
+def matvec_transposed(matrix: jax.Array, v: jax.Array) -> jax.Array:
+    """Compute M'v of M (r, c, ...) and v (r, ...)."""
+    return fold(jnp.add, matrix * v[:, None])
+
+
+def sum_over_blocks(x: jax.Array) -> jax.Array:
+    """Sum (eq, 3, n, ...) over the components and the blocks, the axes 1 and 2: (eq, ...)."""
+    return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(x, 1, 0)), 1, 0))
+
+
+@fenced
+def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Compute A B of matrices (r, c, *lanes) and (c, d, *lanes)."""
+    return each(lambda row: fold(jnp.add, [x * y for x, y in zip(row, b, strict=True)]), a)
+
+
+def matmul_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Compute A B' of matrices (r, c, *lanes) and (d, c, *lanes)."""
+    return matmul(a, jnp.swapaxes(b, 0, 1))
+
+
+def inverse_cholesky(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array:
+    """Invert the Cholesky factor of a symmetric positive definite M = L L', (eq, eq, *lanes): returns L^-1.
+
+    Large matrices are cut in two: with M = [M11 M21'; M21 M22], C = M21 L11^-T and L22 L22' = M22 - C C',
+
+        L^-1 = [L11^-1  0; -L22^-1 C L11^-1  L22^-1],
+
+    which is a third of the work of one elimination.
+
+    Args:
+        matrix: M, (eq, eq, *lanes).
+        floor: (eq, *lanes), the least value of a pivot; eps times the diagonal if None.
+    """
+    size, lanes = matrix.shape[0], matrix.shape[2:]
+    index = jnp.arange(size).reshape(size, *[1] * len(lanes))
+    eye = jnp.eye(size, dtype=matrix.dtype).reshape(size, size, *[1] * len(lanes))
+    least = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix) if floor is None else floor
+    if size > _LARGEST_UNCUT:
+        middle = size // 2
+        first = inverse_cholesky(matrix[:middle, :middle], least[:middle])
+        below = matmul_transposed(matrix[middle:, :middle], first)
+        last = inverse_cholesky(matrix[middle:, middle:] - matmul_transposed(below, below), least[middle:])
+        corner = -matmul(last, matmul(below, first))
+        zero = jnp.zeros((middle, size - middle, *lanes), matrix.dtype)
+        return jnp.concatenate([jnp.concatenate([first, zero], 1), jnp.concatenate([corner, last], 1)])
+
+    def eliminate(j: jax.Array, state: tuple) -> tuple:
+        """Clear column j below the diagonal of M, and do the same to the identity, which becomes L^-1."""
+        remainder, inverse_factor = state
+
+        @fenced
+        def scale(remainder: jax.Array) -> tuple:
+            inverse = lax.rsqrt(jnp.maximum(remainder[j, j], least[j]))
+            return inverse, jnp.where(index > j, remainder[:, j], 0) * (inverse * inverse)
+
+        @fenced
+        def subtract(rows: jax.Array, inverse: jax.Array, multipliers: jax.Array) -> jax.Array:
+            return jnp.where((index == j)[:, None], rows * inverse, rows - multipliers[:, None] * rows[j])
+
+        inverse, multipliers = scale(remainder)
+        return subtract(remainder, inverse, multipliers), subtract(inverse_factor, inverse, multipliers)
+
+    return repeat(size, eliminate, (matrix, jnp.broadcast_to(eye, matrix.shape)))[1]
+
+
+def cholesky_3x3(entries: list[jax.Array]) -> list[jax.Array]:
+    """Factor symmetric positive definite 3x3 matrices; pivots are clamped at eps of the diagonal.
+
+    Args:
+        entries: 00, 10, 11, 20, 21, 22 of the matrices, of any one shape.
+
+    Returns:
+        1/L00, L10, 1/L11, L20, L21, 1/L22 of the factor L.
+    """
     a00, a10, a11, a20, a21, a22 = entries
     eps = jnp.finfo(a00.dtype).eps
     pivot = lambda value, diagonal: lax.rsqrt(jnp.maximum(value, eps * diagonal))
@@ -17,18 +111,18 @@ def cholesky(entries: list[jax.Array]) -> list[jax.Array]:
     return [i0, l10, i1, l20, l21, pivot(a22 - l20 * l20 - l21 * l21, a22)]
 
 
-def down(lower: list[jax.Array], rhs: jax.Array) -> jax.Array:
-    """L^-1 rhs, (3, ..., n, *lanes)."""
-    i0, l10, i1, l20, l21, i2 = lower
+def solve_lower_3x3(factor: list[jax.Array], rhs: jax.Array) -> jax.Array:
+    """Compute L^-1 rhs with L from `cholesky_3x3`, for rhs (3, ...)."""
+    i0, l10, i1, l20, l21, i2 = factor
     a = rhs[0] * i0
     b = (rhs[1] - l10 * a) * i1
     return jnp.stack([a, b, (rhs[2] - l20 * a - l21 * b) * i2])
 
 
-def back(lower: list[jax.Array], rhs: jax.Array) -> jax.Array:
-    """(L L')^-1 rhs, (3, n, *lanes)."""
-    i0, l10, i1, l20, l21, i2 = lower
-    a, b, c = down(lower, rhs)
+def solve_3x3(factor: list[jax.Array], rhs: jax.Array) -> jax.Array:
+    """Compute (L L')^-1 rhs with L from `cholesky_3x3`, for rhs (3, ...)."""
+    i0, l10, i1, l20, l21, i2 = factor
+    a, b, c = solve_lower_3x3(factor, rhs)
     c = c * i2
     b = (b - l21 * c) * i1
     return jnp.stack([(a - l10 * b - l20 * c) * i0, b, c])

@@ -1,4 +1,4 @@
-"""What happened to each element of a batch."""
+"""The outcome of a solve for each element of a batch."""
 
 import enum
 
@@ -20,7 +20,7 @@ class Status(enum.IntEnum):
 
     @property
     def advice(self) -> str:
-        """One sentence for people."""
+        """A sentence that says what the outcome means and what a caller can do."""
         return _ADVICE[self]
 
 

@@ -24,7 +24,7 @@ def group(rng, patterns: np.ndarray, count: int, columns: np.ndarray, start: np.
         sigma=jnp.asarray(rng.uniform(0.1, 1.0, rows)),
         h=jnp.asarray(rng.uniform(0.5, 1.0, rows)),
         present=jnp.ones((count, LANES)),
-        hessian=None,
+        hessian_root=None,
         start=jnp.asarray(start),
     )
 

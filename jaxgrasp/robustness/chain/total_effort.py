@@ -31,7 +31,7 @@ from jaxgrasp.robustness.chain.verdicts import Verdict, programs, solved_program
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
 from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.block.arrow import ArrowProblem, patterns_of
+from jaxgrasp.solvers.block.arrow import ArrowProblem, build_rows
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.interior_point import Settings
 from jaxgrasp.solvers.status import Status
@@ -250,15 +250,15 @@ def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) 
     largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (own, change)])
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     targets = jnp.concatenate([shared.load[:, None] - grasps.asked * shared.targets, shared.load[:, None]], 1)
-    patterns, h = patterns_of(pyramid_facets(cone_edges), dtype, 3)
+    patterns, h = build_rows(pyramid_facets(cone_edges), dtype, 3)
     problem = ArrowProblem(
         patterns=patterns,
         h=h,
         columns=shared.columns[:, :, :, None],
         rhs=targets,
         dropped=shared.dropped[:, None],
-        own=(own / unit)[:, :, :, None],
-        change=(change / unit)[:, :, :, None],
+        hub_hessian=(own / unit)[:, :, :, None],
+        copy_hessian=(change / unit)[:, :, :, None],
         guess=guess,
     )
     return problem, unit

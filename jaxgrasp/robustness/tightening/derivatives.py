@@ -321,6 +321,6 @@ def _iterate(
             slack = kappa / jnp.where(group.present > 0, z_g, 1)
         s.append(jnp.where(group.present > 0, clean(slack, 1), 1))
         stationary = adjoint_rows(group, z_g)
-        pull.append(stationary if group.hessian is None else stationary + apply_hessian(group, x_g))
+        pull.append(stationary if group.hessian_root is None else stationary + apply_hessian(group, x_g))
     blocks, y = tuple(x), -problem.equality(tuple(pull))
     return Iterate((blocks, lam) if problem.bordered else blocks, y, tuple(s), tuple(z))

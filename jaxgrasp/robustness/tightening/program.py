@@ -115,7 +115,7 @@ class Program:
             sigma=self.sigma,
             h=self.h,
             present=self.present,
-            hessian=None,
+            hessian_root=None,
             start=literal(np.array([0.0, 0.0, -0.6]), self.h.dtype),
         )
 
@@ -309,8 +309,8 @@ def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort
     largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
     largest = jnp.where(largest > 0, largest, 1)
 
-    def held(group: Blocks, hessian: jax.Array) -> Blocks:
-        return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * wanted, hessian=hessian)
+    def held(group: Blocks, root: jax.Array) -> Blocks:
+        return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * wanted, hessian_root=root)
 
     # The actuators' efforts cost nothing.
     groups = (held(blocks, root / largest), *[held(g, jnp.zeros_like(g.present)[None, None]) for g in others])

@@ -3,8 +3,21 @@
     min 1/2 x_0' H_0 x_0 + sum_j 1/2 (x_j - x_0)' H (x_j - x_0)   over x_0, x_1 .. x_J, blocks of three each, with
     A x_ji <= h   and   sum_i E_i x_ji = b_j.
 
-The Newton matrix is an arrow: given x_0, the copies have nothing to do with each other. Their blocks are eliminated,
-then their equalities, then x_0, so a step costs O(J (n + n^2) + n^3); a dense factorisation would cost O(J^3 n^3).
+The Newton matrix is an arrow: given x_0, the hub, the copies have nothing to do with each other. With the weights W of
+the rows, P_j = A'W_j A + H and P_0 = A'W_0 A + H_0 + J H, a step solves
+
+    P_j dx_j - H dx_0 + E'dy_j = r_j,    E dx_j = q_j            for every copy j,
+    P_0 dx_0 - sum_j H dx_j + E'dy_0 = r_0,    E dx_0 = q_0.
+
+The blocks of the copies are eliminated, then their equalities, with F_j = P_j^-1 H, a Cholesky factor of
+E P_j^-1 E' = L_j L_j' and G_j = L_j^-1 E F_j:
+
+    dx_j = P_j^-1 (r_j - E'dy_j) + F_j dx_0,    L_j'dy_j = L_j^-1 (E P_j^-1 r_j - q_j) + G_j dx_0,
+
+    (P_0 - sum_j (H F_j - G_j'G_j)) dx_0 + E'dy_0 = r_0 + sum_j (H P_j^-1 r_j - G_j'L_j^-1 (E P_j^-1 r_j - q_j)).
+
+The last system, of 3 n unknowns and the equalities of the hub, is solved by inverse Cholesky factors. A step costs
+O(J (n + n^2) + n^3); a dense factorisation would cost O(J^3 n^3).
 
 Callers scale: |x|_inf <= 1 at admissible points, rows of E orthonormal or zero, entries of H at most 1.
 """
@@ -18,13 +31,20 @@ import numpy as np
 
 from jaxgrasp.arrays import fold, literal
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers.block.kkt import inverse_root, spread_over
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
-from jaxgrasp.solvers.small_matrices import back, cholesky
+from jaxgrasp.solvers.small_matrices import (
+    cholesky_3x3,
+    inverse_cholesky,
+    matvec,
+    matvec_transposed,
+    solve_3x3,
+    spread_over,
+    sum_over_blocks,
+)
 
 
 class ArrowRecord(NamedTuple):
-    """Best bounds so far, certified, and the points that give them: x one of them, (y, z) with `tangent` the other."""
+    """The best certified bounds so far and their points: x for the upper, (y, z) and `tangent` for the lower one."""
 
     lower: jax.Array
     upper: jax.Array
@@ -35,13 +55,15 @@ class ArrowRecord(NamedTuple):
 
 
 class _Factors(NamedTuple):
-    lower: list[jax.Array]  # of the blocks of all copies, (n, J, *lanes)
-    follow: jax.Array  # (3, 3, n, J, *lanes), how x_j follows x_0 while its equalities are free
-    roots: jax.Array  # (eq, eq, J, *lanes), inverse Cholesky factors of the copies' equalities
-    reach: jax.Array  # (eq, 3, n, J, *lanes), roots E follow
-    hub: jax.Array  # (3 n, 3 n, *lanes), the same of what is left for x_0
-    hub_root: jax.Array  # (eq, eq, *lanes), and of its equalities
-    hub_columns: jax.Array  # (eq, 3 n, *lanes), E hub'
+    """The reduced Newton system, in the letters of the module's docstring."""
+
+    blocks: list[jax.Array]  # Cholesky factors of the 3x3 blocks of P_j, (n, J, *lanes)
+    follow: jax.Array  # (3, 3, n, J, *lanes), F_j
+    roots: jax.Array  # (eq, eq, J, *lanes), L_j^-1
+    reach: jax.Array  # (eq, 3, n, J, *lanes), G_j
+    hub: jax.Array  # (3 n, 3 n, *lanes), K, the inverse Cholesky factor of the matrix of dx_0
+    hub_root: jax.Array  # (eq, eq, *lanes), the inverse Cholesky factor of E K'K E'
+    hub_columns: jax.Array  # (eq, 3 n, *lanes), E K'
     weights: jax.Array
 
 
@@ -51,107 +73,91 @@ class ArrowProblem:
     """The program for `interior_point.solve`; x is (3, n, J + 1, *lanes), x_0 last, rows (m, n, J + 1, *lanes)."""
 
     patterns: jax.Array
-    """(m, 3), A."""
+    """The rows A, (m, 3)."""
     h: jax.Array
-    """(m, 1, 1, *1)."""
+    """The right-hand sides of the rows, (m, 1, 1, *1)."""
     columns: jax.Array
-    """(eq, 3, n, 1, *lanes), E; zero where dropped or absent."""
+    """E, (eq, 3, n, 1, *lanes); zero where a row is dropped or a block absent."""
     rhs: jax.Array
-    """(eq, J + 1, *lanes), b_j."""
+    """The right-hand sides b_j of the equality rows, (eq, J + 1, *lanes)."""
     dropped: jax.Array
-    """(eq, 1, *lanes), 1 for equality rows that are zero."""
-    own: jax.Array
-    """(3, 3, n, 1, *lanes), blocks of H_0."""
-    change: jax.Array
-    """(3, 3, n, 1, *lanes), blocks of H."""
+    """A mask of the equality rows, (eq, 1, *lanes): 1 for rows that are zero, else 0."""
+    hub_hessian: jax.Array
+    """The blocks of H_0, (3, 3, n, 1, *lanes)."""
+    copy_hessian: jax.Array
+    """The blocks of H, (3, 3, n, 1, *lanes)."""
     guess: jax.Array
-    """(3, n, J + 1, *lanes), where to start: inside the rows, if possible."""
+    """A point to start from, (3, n, J + 1, *lanes): inside the rows, if possible."""
 
     @property
     def lanes(self) -> tuple[int, ...]:
-        """Shape of the trailing axes."""
+        """The shape of the trailing axes."""
         return self.rhs.shape[2:]
 
     @property
     def present(self) -> jax.Array:
-        """Every row counts."""
+        """The mask of rows: every row counts."""
         return jnp.ones((1,) * self.guess.ndim, self.rhs.dtype)
 
     @property
     def predictor(self) -> Self:
-        """Nothing is refined."""
+        """The problem itself: its directions are not refined beyond one solve."""
         return self
 
     def apply(self, x: jax.Array) -> jax.Array:
-        """A x."""
-        return fold(jnp.add, spread_over(self.patterns.T, x) * x[:, None])
+        """Compute A x, (m, n, J + 1, *lanes)."""
+        return matvec_transposed(spread_over(self.patterns.T, x), x)
 
     def adjoint(self, z: jax.Array) -> jax.Array:
-        """A'z."""
-        return fold(jnp.add, spread_over(self.patterns, z) * z[:, None])
+        """Compute A'z, (3, n, J + 1, *lanes)."""
+        return matvec_transposed(spread_over(self.patterns, z), z)
 
     def equality(self, x: jax.Array) -> jax.Array:
-        """E x, (eq, copies, *lanes)."""
-        return _over_blocks(self.columns * x)
+        """Compute E x, (eq, J + 1, *lanes)."""
+        return sum_over_blocks(self.columns * x)
 
     def pull_back(self, y: jax.Array) -> jax.Array:
-        """E'y."""
+        """Compute E'y, (3, n, J + 1, *lanes)."""
         return fold(jnp.add, self.columns * y[:, None, None])
 
     def project(self, x: jax.Array) -> jax.Array:
-        """The nearest point with E x = b."""
+        """Find the nearest point with E x = b: the rows of E are orthonormal."""
         return x + self.pull_back(self.rhs - self.equality(x))
 
     def gradient(self, x: jax.Array) -> jax.Array:
-        """Of the objective."""
-        moved = _times(self.change, x[:, :, :-1] - x[:, :, -1:])
-        rest = _times(self.own, x[:, :, -1:]) - _copies(moved)
-        return jnp.concatenate([moved, rest], 2)
+        """Compute the gradient of the objective at x, shaped like x."""
+        moved = matvec(self.copy_hessian, x[:, :, :-1] - x[:, :, -1:])
+        hub = matvec(self.hub_hessian, x[:, :, -1:]) - _sum_copies(moved)
+        return jnp.concatenate([moved, hub], 2)
 
     def objective(self, x: jax.Array) -> jax.Array:
-        """Of x, (*lanes)."""
+        """Compute the objective at x, (*lanes)."""
         moved = x[:, :, :-1] - x[:, :, -1:]
         return 0.5 * (
-            _total(moved * _times(self.change, moved)) + _total(x[:, :, -1:] * _times(self.own, x[:, :, -1:]))
+            _total(moved * matvec(self.copy_hessian, moved))
+            + _total(x[:, :, -1:] * matvec(self.hub_hessian, x[:, :, -1:]))
         )
 
     def start(self) -> Iterate:
-        """From the guess, with slacks of at least 0.03 and multipliers on the central path."""
+        """Start from the guess, with slacks of at least 0.03 and multipliers on the central path s z = 0.02."""
         x = self.project(self.guess)
         s = jnp.maximum(self.h - self.apply(x), 0.03)
         z = 0.02 / s
         return Iterate(x, -self.equality(self.gradient(x) + self.adjoint(z)), s, z)
 
     def residuals(self, iterate: Iterate) -> Residuals:
-        """Of stationarity, of E x = b and of the rows."""
+        """Compute the residuals of stationarity, of E x = b and of the rows."""
         dual = self.gradient(iterate.x) + self.adjoint(iterate.z) + self.pull_back(iterate.y)
         return Residuals(dual, self.equality(iterate.x) - self.rhs, self.apply(iterate.x) + iterate.s - self.h)
 
     def factor(self, weights: jax.Array) -> _Factors:
-        """Eliminate the copies' blocks, their equalities, then x_0."""
+        """Factor the Newton system: eliminate the copies' blocks, their equalities, then x_0."""
         eq, _, n = self.columns.shape[:3]
+        factors, follow, matrix, across, hub = fenced(self._eliminate_copies)(weights)
 
-        @fenced
-        def blocks(weights: jax.Array) -> tuple:
-            pairs = [(a, b) for a in range(3) for b in range(a + 1)]
-            grams = [
-                fold(jnp.add, spread_over(self.patterns[:, a] * self.patterns[:, b], weights) * weights)
-                for a, b in pairs
-            ]
-            lower = cholesky([g[:, :-1] + self.change[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
-            follow = jnp.stack([back(lower, self.change[:, b]) for b in range(3)], 1)
-            solved = jnp.stack([back(lower, self.columns[r]) for r in range(eq)])
-            matrix = jnp.stack([_over_blocks(self.columns * solved[r]) for r in range(eq)])
-            across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
-            full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(3) for b in range(3)]
-            hub = jnp.stack(full).reshape(3, 3, *full[0].shape)[:, :, :, -1:] + self.own
-            # H - H (H + A'WA)^-1 H of every copy.
-            lost = self.change - fold(jnp.add, jnp.moveaxis(self.change[:, :, None] * follow[None], 1, 0))
-            return lower, follow, matrix, across, (hub + _copies(lost, 3))[:, :, :, 0]
-
-        lower, follow, matrix, across, hub = blocks(weights)
+        # Equalities of the copies: G_j = L_j^-1 E F_j, and the sum of G_j'G_j for the hub.
         eye = jnp.eye(eq, dtype=weights.dtype).reshape(eq, eq, *[1] * (self.rhs.ndim - 1))
-        roots = inverse_root(matrix + eye * self.dropped)
+        roots = inverse_cholesky(matrix + eye * self.dropped)
 
         @fenced
         def couple(roots: jax.Array, across: jax.Array, hub: jax.Array) -> tuple:
@@ -162,7 +168,9 @@ class ArrowProblem:
             return reach, whole + blocks.reshape(3 * n, 3 * n, *self.lanes)
 
         reach, whole = couple(roots, across, hub)
-        inverse = inverse_root(whole)
+
+        # The hub and its equalities.
+        inverse = inverse_cholesky(whole)
 
         @fenced
         def tie(inverse: jax.Array) -> tuple:
@@ -172,39 +180,58 @@ class ArrowProblem:
 
         turned, tied = tie(inverse)
         return _Factors(
-            lower,
+            factors,
             follow,
             roots,
             reach,
             inverse,
-            inverse_root(tied + eye[..., 0, :] * self.dropped[:, 0]),
+            inverse_cholesky(tied + eye[..., 0, :] * self.dropped[:, 0]),
             turned,
             weights,
         )
 
+    def _eliminate_copies(self, weights: jax.Array) -> tuple:
+        """Compute factors of P_j, F_j, E P_j^-1 E' and E F_j of the copies, and the blocks of P_0 - sum_j H F_j."""
+        eq = len(self.columns)
+        pairs = [(a, b) for a in range(3) for b in range(a + 1)]
+        grams = [
+            fold(jnp.add, spread_over(self.patterns[:, a] * self.patterns[:, b], weights) * weights) for a, b in pairs
+        ]
+        factors = cholesky_3x3([g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
+        follow = jnp.stack([solve_3x3(factors, self.copy_hessian[:, b]) for b in range(3)], 1)
+        solved = jnp.stack([solve_3x3(factors, self.columns[r]) for r in range(eq)])
+        matrix = jnp.stack([sum_over_blocks(self.columns * solved[r]) for r in range(eq)])
+        across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
+        full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(3) for b in range(3)]
+        hub = jnp.stack(full).reshape(3, 3, *full[0].shape)[:, :, :, -1:] + self.hub_hessian
+        # H - H P_j^-1 H of every copy, whose sum over the copies joins H_0 + A'W_0 A.
+        remainder = self.copy_hessian - fold(jnp.add, jnp.moveaxis(self.copy_hessian[:, :, None] * follow[None], 1, 0))
+        return factors, follow, matrix, across, (hub + _sum_copies(remainder, 3))[:, :, :, 0]
+
     def solve(self, factors: _Factors, residuals: Residuals, shift: jax.Array) -> tuple:
-        """See `interior_point.Problem`."""
+        """Solve the Newton system with dz = shift + weights * A dx for the directions (dx, dy, A dx)."""
         n = self.columns.shape[2]
 
         @fenced
         def newton(rhs: jax.Array, rhs_y: jax.Array) -> tuple:
-            first = back(factors.lower, rhs[:, :, :-1])
-            lacking = _rows(factors.roots, self.equality(first) - rhs_y[:, :-1])
-            push = fold(jnp.add, factors.reach * lacking[:, None, None])
-            # H (P^-1 r - P^-1 E' M^-1 (..)), the second term by the transpose of `reach`.
-            right = rhs[:, :, -1:] + _copies(_times(self.change, first) - push)
+            # Copies, while x_0 stays: P_j^-1 r_j and L_j^-1 (E P_j^-1 r_j - q_j).
+            first = solve_3x3(factors.blocks, rhs[:, :, :-1])
+            root_y = matvec(factors.roots, self.equality(first) - rhs_y[:, :-1])
+
+            # The hub: its right-hand side, then dy_0 and dx_0.
+            push = fold(jnp.add, factors.reach * root_y[:, None, None])
+            right = rhs[:, :, -1:] + _sum_copies(matvec(self.copy_hessian, first) - push)
             flat = jnp.swapaxes(right[:, :, 0], 0, 1).reshape(3 * n, *self.lanes)
-            half = _rows(factors.hub, flat)
-            y = _rows(
-                factors.hub_root, fold(jnp.add, jnp.swapaxes(factors.hub_columns, 0, 1) * half[:, None]) - rhs_y[:, -1]
-            )
-            y = _columns(factors.hub_root, y)
-            rest = _columns(factors.hub, half - fold(jnp.add, factors.hub_columns * y[:, None]))
-            rest = jnp.swapaxes(rest.reshape(n, 3, *self.lanes), 0, 1)[:, :, None]
-            moved = lacking + _over_blocks(factors.reach * rest)
-            own_y = _columns(factors.roots, moved)
-            own = first + _times(factors.follow, rest) - back(factors.lower, self.pull_back(own_y))
-            return jnp.concatenate([own, rest], 2), jnp.concatenate([own_y, y[:, None]], 1)
+            root_right = matvec(factors.hub, flat)
+            hub_y = matvec(factors.hub_root, matvec(factors.hub_columns, root_right) - rhs_y[:, -1])
+            hub_y = matvec_transposed(factors.hub_root, hub_y)
+            hub = matvec_transposed(factors.hub, root_right - matvec_transposed(factors.hub_columns, hub_y))
+            hub = jnp.swapaxes(hub.reshape(n, 3, *self.lanes), 0, 1)[:, :, None]
+
+            # Back to the copies: dy_j and dx_j.
+            copies_y = matvec_transposed(factors.roots, root_y + sum_over_blocks(factors.reach * hub))
+            copies = first + matvec(factors.follow, hub) - solve_3x3(factors.blocks, self.pull_back(copies_y))
+            return jnp.concatenate([copies, hub], 2), jnp.concatenate([copies_y, hub_y[:, None]], 1)
 
         def improve(_: jax.Array, state: tuple) -> tuple:
             dx, dy, rows = state
@@ -217,24 +244,26 @@ class ArrowProblem:
         return repeat(1, improve, jax.tree.map(jnp.zeros_like, (residuals.dual, residuals.primal, residuals.rows)))
 
     def first_record(self) -> ArrowRecord:
-        """Nothing is known."""
+        """Make the record before the first step: no bound yet."""
         inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
         rows = jnp.zeros((self.patterns.shape[0], *self.guess.shape[1:]), self.rhs.dtype)
         return ArrowRecord(-inf, inf, jnp.zeros_like(self.guess), jnp.zeros_like(self.rhs), rows, self.guess)
 
     def gap_scale(self, record: ArrowRecord) -> jax.Array:
-        """The effort, but not less than a thousandth of a unit."""
+        """Measure gaps by the effort, but by no less than a thousandth of a unit."""
         return jnp.maximum(jnp.where(jnp.isinf(record.upper), 0, record.upper), 1e-3)
 
     def assess(self, iterate: Iterate, residuals: Residuals, record: ArrowRecord) -> ArrowRecord:
-        """Both bounds; what a point misses the rows by is charged at the rows' multipliers."""
+        """Update both bounds; violations of the rows are charged at the rows' multipliers."""
         x = self.project(iterate.x)
+        # A point that all but meets the rows attains the upper bound.
         over = jnp.maximum(self.apply(x) - self.h, 0)
-        missed = fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, over)))
+        violation = fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, over)))
         near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
-        upper = jnp.where(missed <= near, self.objective(x) + _total(over * iterate.z), jnp.inf)
-        held = _total(self.h * iterate.z) + fold(jnp.add, fold(jnp.add, iterate.y * self.rhs))
-        lower = -self.objective(iterate.x) - held - _total(jnp.abs(residuals.dual))
+        upper = jnp.where(violation <= near, self.objective(x) + _total(over * iterate.z), jnp.inf)
+        # By convexity f(u) >= f(x) + f'(x)(u - x), so f >= -f(x) - h'z - b'y - |r|_1 with r the dual residual.
+        sides = _total(self.h * iterate.z) + fold(jnp.add, fold(jnp.add, iterate.y * self.rhs))
+        lower = -self.objective(iterate.x) - sides - _total(jnp.abs(residuals.dual))
         falls, rises = upper < record.upper, lower > record.lower
         return ArrowRecord(
             lower=jnp.where(rises, lower, record.lower),
@@ -246,47 +275,36 @@ class ArrowProblem:
         )
 
     def proven(self, record: ArrowRecord) -> jax.Array:
-        """What the multipliers prove about the least objective, by its tangent, (*lanes)."""
+        """Compute the lower bound that the multipliers and the objective's tangent prove, (*lanes), as in `assess`."""
         slope = self.gradient(record.tangent) + self.adjoint(record.z) + self.pull_back(record.y)
-        held = _total(self.h * record.z) + fold(jnp.add, fold(jnp.add, record.y * self.rhs))
-        return -self.objective(record.tangent) - held - _total(jnp.abs(slope))
+        sides = _total(self.h * record.z) + fold(jnp.add, fold(jnp.add, record.y * self.rhs))
+        return -self.objective(record.tangent) - sides - _total(jnp.abs(slope))
 
     def lagrangian(self, record: ArrowRecord) -> jax.Array:
-        """Objective and what is lacking, weighed by the multipliers: its derivative is the optimum's (envelope)."""
+        """Compute f + z'(A x - h) + y'(E x - b): its derivative is that of the optimum (envelope theorem)."""
         rows = self.apply(record.x) - self.h
-        lacking = fold(jnp.add, fold(jnp.add, record.y * (self.equality(record.x) - self.rhs)))
-        return self.objective(record.x) + _total(record.z * rows) + lacking
+        equalities = fold(jnp.add, fold(jnp.add, record.y * (self.equality(record.x) - self.rhs)))
+        return self.objective(record.x) + _total(record.z * rows) + equalities
 
 
-def patterns_of(facets: np.ndarray, dtype: jnp.dtype, axes: int) -> tuple[jax.Array, jax.Array]:
-    """The rows A of facets and of a bound on what pushes, and their right-hand sides."""
+def build_rows(facets: np.ndarray, dtype: jnp.dtype, axes: int) -> tuple[jax.Array, jax.Array]:
+    """Build the rows A x <= h of friction facets and of a bound on the pushing force.
+
+    Args:
+        facets: (m - 1, 3), the facets' normals.
+        dtype: precision.
+        axes: how many axes follow the rows.
+
+    Returns:
+        A, (m, 3), and h, (m, *1).
+    """
     rows = literal(np.concatenate([facets, [[0.0, 0.0, -1.0]]]), dtype)
     return rows, literal(np.array([0.0] * len(facets) + [1.0]), dtype).reshape(-1, *[1] * axes)
 
 
-def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
-    """Blocks (3, 3, n, ...) times (3, n, ...)."""
-    return fold(jnp.add, jnp.swapaxes(matrix, 0, 1) * x[:, None])
-
-
-def _rows(matrix: jax.Array, v: jax.Array) -> jax.Array:
-    """M v, of (r, c, ...)."""
-    return fold(jnp.add, jnp.swapaxes(matrix, 0, 1) * v[:, None])
-
-
-def _columns(matrix: jax.Array, v: jax.Array) -> jax.Array:
-    """M'v."""
-    return fold(jnp.add, matrix * v[:, None])
-
-
-def _copies(x: jax.Array, axis: int = 2) -> jax.Array:
+def _sum_copies(x: jax.Array, axis: int = 2) -> jax.Array:
     """Sum over copies, which stay as an axis of length one."""
     return jnp.sum(x, axis, keepdims=True)
-
-
-def _over_blocks(x: jax.Array) -> jax.Array:
-    """Sum over components and blocks, (eq, 3, n, copies, *lanes) -> (eq, copies, *lanes)."""
-    return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(x, 1, 0)), 1, 0))
 
 
 def _total(x: jax.Array) -> jax.Array:

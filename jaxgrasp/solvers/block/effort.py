@@ -1,4 +1,4 @@
-"""min 1/2 sum x_i' H_i x_i over blocks, lambda held: the form of (22)."""
+"""The program min 1/2 sum x_i' H_i x_i over blocks, lambda held: the form of (22)."""
 
 from dataclasses import dataclass
 
@@ -24,13 +24,12 @@ from jaxgrasp.solvers.interior_point import Iterate, Residuals
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EffortProblem(BlockProblem):
-    """min 1/2 sum x_i' H_i x_i, lambda held: sigma is not looked at.
+    """The program min 1/2 sum x_i' H_i x_i with lambda held, so sigma plays no part.
 
-    Record: `upper` is attained by `x`, `lower` is certified by (y, z).
+    In its record, `x` attains `upper` and (y, z) certify `lower`. Callers scale H so that its entries are 1 at most;
+    the blocks' bounds are |x|_inf <= 1.
 
-    H is scaled so that its entries are 1 at most. Without lambda the blocks' bounds are |x|_inf <= 1.
-
-    guess: where to start, meeting E x = b about, well inside the rows if possible.
+    guess: a point to start from that nearly meets E x = b, well inside the rows if possible.
     curvature: like x, c >= 0 with H - diag(c) positive semidefinite, see `least_curvature`.
     """
 
@@ -39,7 +38,7 @@ class EffortProblem(BlockProblem):
     bordered = False
 
     def start(self) -> Iterate:
-        """From the guess, with slacks of at least 0.03 and multipliers on the central path."""
+        """Start from the guess, with slacks of at least 0.03 and multipliers on the central path s z = 0.02."""
         blocks = self.project(self.guess)
         s = tuple(
             jnp.where(g.present > 0, jnp.maximum(g.h - apply_rows(g, x), 0.03), 1)
@@ -52,7 +51,7 @@ class EffortProblem(BlockProblem):
         return Iterate(blocks, -self.equality(pull), s, z)
 
     def residuals(self, iterate: Iterate) -> Residuals:
-        """Of stationarity, of E x = b and of the rows."""
+        """Compute the residuals of stationarity, of E x = b and of the rows."""
         blocks = iterate.x
         dual = tuple(
             apply_hessian(g, x) + adjoint_rows(g, z) + e
@@ -62,7 +61,7 @@ class EffortProblem(BlockProblem):
         return Residuals(dual, self.equality(blocks) - self.rhs, rows)
 
     def solve(self, factors: Factors, residuals: Residuals, shift: Rows) -> tuple:
-        """See `interior_point.Problem`."""
+        """Solve the Newton system with dz = shift + weights * A dx for the directions (dx, dy, A dx)."""
 
         def improve(_: jax.Array, state: tuple) -> tuple:
             dx, dy, rows = state
@@ -80,22 +79,22 @@ class EffortProblem(BlockProblem):
         return repeat(1 + self.refinements, improve, zero)
 
     def first_record(self) -> Record:
-        """Nothing is known."""
+        """Make the record before the first step: no bound yet."""
         inf = jnp.full(self.lanes, jnp.inf, self.rhs.dtype)
         return Record(-inf, inf, tuple(jnp.zeros_like(x) for x in self.guess), *self.first_multipliers())
 
     def gap_scale(self, record: Record) -> jax.Array:
-        """The effort, but not less than a thousandth of a unit."""
+        """Measure gaps by the effort, but by no less than a thousandth of a unit."""
         return jnp.maximum(jnp.where(jnp.isinf(record.upper), 0, record.upper), 1e-3)
 
     def assess(self, iterate: Iterate, residuals: Residuals, record: Record) -> Record:
-        """Both bounds.
+        """Update both bounds.
 
-        What a point misses the rows by is charged at the rows' multipliers, twice: what it saves, and as much again, so
-        that the effort itself, too, is within the bounds' distance of the least.
+        Upper: row violations are charged at twice their multipliers, once for what violating saves, once so that the
+        effort itself stays within the gap of the optimum.
 
-        With r = H x + A'z + E'y no u that meets the rows has an effort below -1/2 x'H x - h'z - b'y + r'u +
-        1/2 (u - x)'H (u - x), whose last two terms `_lost` bounds from below.
+        Lower: with r = H x + A'z + E'y no u that meets the rows has an effort below -1/2 x'H x - h'z - b'y + r'u +
+        1/2 (u - x)'H (u - x), whose last two terms are at least minus `_largest_loss`.
         """
         x = fenced(self.project)(iterate.x)
 
@@ -104,13 +103,13 @@ class EffortProblem(BlockProblem):
             return 0.5 * fold(jnp.add, terms)
 
         over = [jnp.maximum(apply_rows(g, x_g) - g.h, 0) for g, x_g in zip(self.groups, x, strict=True)]
-        missed = fold(jnp.maximum, [-least(-o) for o in over])
+        violation = fold(jnp.maximum, [-least(-o) for o in over])
         charge = fold(jnp.add, [total(o * z) for o, z in zip(over, iterate.z, strict=True)])
         near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
-        upper = jnp.where(missed <= near, value(x) + 2 * charge, jnp.inf)
-        held = fold(jnp.add, [total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
-        lost = map(_lost, self.curvature, iterate.x, residuals.dual)
-        lower = -value(iterate.x) - held - fold(jnp.add, iterate.y * self.rhs) - fold(jnp.add, map(total, lost))
+        upper = jnp.where(violation <= near, value(x) + 2 * charge, jnp.inf)
+        sides = fold(jnp.add, [total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
+        losses = map(_largest_loss, self.curvature, iterate.x, residuals.dual)
+        lower = -value(iterate.x) - sides - fold(jnp.add, iterate.y * self.rhs) - fold(jnp.add, map(total, losses))
         falls, rises = upper < record.upper, lower > record.lower
         return Record(
             lower=jnp.where(rises, lower, record.lower),
@@ -122,18 +121,18 @@ class EffortProblem(BlockProblem):
 
 
 def least_curvature(root: jax.Array) -> jax.Array:
-    """Some c >= 0, (k, n, *lanes), with H - diag(c) diagonally dominant: for a diagonal H its diagonal.
+    """Find a c >= 0, (k, n, *lanes), with H - diag(c) diagonally dominant: for a diagonal H its diagonal.
 
     Args:
         root: (k, k, n, *lanes), H = root' root.
     """
     matrix = jnp.stack([fold(jnp.add, root * column[:, None]) for column in jnp.moveaxis(root, 1, 0)])
-    rest = lambda a, row: [jnp.abs(entry) for b, entry in enumerate(row) if b != a]
-    return jnp.maximum(jnp.stack([row[a] - sum(rest(a, row)) for a, row in enumerate(matrix)]), 0)
+    off_diagonal = lambda a, row: [jnp.abs(entry) for b, entry in enumerate(row) if b != a]
+    return jnp.maximum(jnp.stack([row[a] - sum(off_diagonal(a, row)) for a, row in enumerate(matrix)]), 0)
 
 
-def _lost(curvature: jax.Array, x: jax.Array, r: jax.Array) -> jax.Array:
-    """The most that -r u - c/2 (u - x)^2 can be, for every unknown |u| <= 1: of two bounds the better one.
+def _largest_loss(curvature: jax.Array, x: jax.Array, r: jax.Array) -> jax.Array:
+    """Bound -r u - c/2 (u - x)^2 from above over |u| <= 1, for every unknown: by r^2/(2 c) - r x or by |r|.
 
     Where the objective is curved, u is near x, and the sign of r x counts: in float32 this bound is far tighter.
     """

@@ -5,14 +5,34 @@ With blocks x_i (three forces of a contact, or one bounded actuator effort), a s
     A x_i + sigma_i lambda <= h_i      for every block i,
     sum_i E_i x_i = b                  (a static number of equality rows),
 
-`margin_problem` maximises lambda, `effort_problem` minimises 1/2 sum x_i' H_i x_i with lambda held. The rows A are the
-same for every block of a group, so they are never stored. The Newton system is reduced block by block (k x k), then
-lambda, then the equality rows: the cost is linear in the number of blocks.
+`margin` maximises lambda, `effort` minimises 1/2 sum x_i' H_i x_i with lambda held. All blocks of a group have the same
+rows A, so that a group stores them once.
 
-Both certify their answers at every step. Any x with E x = b attains lambda_lo = min (h - A x) / sigma. Any z >= 0
-scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1; radius bounds |x|_inf at the optimum.
+With the weights W = Z/S of the rows, A and sigma over all blocks, and dz = e + W (A dx + sigma dlambda), a step solves
+
+    [ P   p              E' ] [dx     ]   [ r_x      ]
+    [ p'  sigma'W sigma  0  ] [dlambda] = [ r_lambda ]        P = A'W A + H,    p = A'W sigma.
+    [ E   0              0  ] [dy     ]   [ r_y      ]
+
+P is made of k x k blocks. Eliminating them and then lambda leaves, with v = -E P^-1 p, the equality rows:
+
+    dx = P^-1 (r_x - p dlambda - E'dy),
+    kappa dlambda = r_lambda - p'P^-1 r_x - v'dy,    kappa = sigma'W sigma - p'P^-1 p,
+    (E P^-1 E' + v v'/kappa) dy = E P^-1 r_x - r_y + v (r_lambda - p'P^-1 r_x) / kappa,
+
+at a cost that is linear in the number of blocks. Near an optimum W goes to infinity in active rows and to 0 in the
+others. Forming A'W A would square the condition of W^1/2 A, and kappa as a difference would cancel. So the columns of
+W^1/2 [A, sigma] (with a root of H below A) are made orthogonal instead: the coefficients are L, with L L' = P, and
+theta = L^-1 p, and the square of what remains of the last column is kappa.
+
+Both programs certify their results at every step. Any x with E x = b attains lambda_lo = min (h - A x) / sigma. Any
+z >= 0 scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1; radius bounds |x|_inf at the
+optimum.
 
 Callers scale: |x| about 1 at most, sigma <= 1, the rows of E orthonormal or zero.
+
+Sources: Wright (1997), "Primal-dual interior-point methods", chapter 11; Bjorck (1967), "Solving linear least squares
+problems by Gram-Schmidt orthogonalization".
 """
 
 from abc import ABC, abstractmethod
@@ -23,24 +43,23 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.lanes.fence import each, fenced, repeat
+from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
+from jaxgrasp.solvers.small_matrices import inverse_cholesky, matvec_transposed, spread_over
 
 Rows = tuple[jax.Array, ...]
-# Matrices of the equality rows up to this size are factored as they are.
-_UNDIVIDED = 16
 
 
 class Blocks(NamedTuple):
     """A group of n blocks of k unknowns, each with the same m rows A; lanes trail.
 
-    patterns: (m, k), the rows A; the last one opposes the sum of the others, so that positive multipliers balance.
-    columns: (eq, k, n, *lanes), E_i; zero where a block is absent.
-    sigma: (m, n, *lanes), the border column, >= 0; zero where absent.
-    h: (m, n, *lanes), right-hand sides; one where absent.
-    present: (n, *lanes), 1 or 0.
-    hessian: (k, k, n, *lanes), a root of H_i (H_i = root' root), for `EffortProblem`.
-    start: (k,), where the unknowns of a block start.
+    patterns: the rows A, (m, k); the last one opposes the sum of the others, so that positive multipliers balance.
+    columns: E_i, (eq, k, n, *lanes); zero where a block is absent.
+    sigma: the column of lambda, (m, n, *lanes), >= 0; zero where a block is absent.
+    h: the right-hand sides, (m, n, *lanes); one where a block is absent.
+    present: a mask of the blocks, (n, *lanes): 1 or 0.
+    hessian_root: a root of H_i (H_i = root' root), (k, k, n, *lanes), for `EffortProblem`; None where H = 0.
+    start: the unknowns of every block at the start, (k,).
     """
 
     patterns: jax.Array
@@ -48,18 +67,18 @@ class Blocks(NamedTuple):
     sigma: jax.Array
     h: jax.Array
     present: jax.Array
-    hessian: jax.Array | None
+    hessian_root: jax.Array | None
     start: jax.Array
 
     @property
     def root(self) -> jax.Array:
-        """`hessian`, of blocks that have one."""
-        assert self.hessian is not None
-        return self.hessian
+        """The root of H of blocks that have one."""
+        assert self.hessian_root is not None
+        return self.hessian_root
 
 
 class Record(NamedTuple):
-    """Best bounds so far, certified, and the points that give them: x one of them, (y, z) the other."""
+    """The best certified bounds so far and the points that give them: x the attained one, (y, z) the proven one."""
 
     lower: jax.Array
     upper: jax.Array
@@ -69,50 +88,45 @@ class Record(NamedTuple):
 
 
 class _BlockFactor(NamedTuple):
-    """L with L L' = P = A'WA (+ H) and what is solved with it; lists run over the k unknowns."""
+    """The Cholesky factor L of P, and solutions with it; lists run over the k unknowns of a block."""
 
     below: list[jax.Array]  # L10, L20, L21, each (n, *lanes)
-    inverse: list[jax.Array]  # 1 / diag(L)
+    inverse: list[jax.Array]  # 1 / diag(L), each (n, *lanes)
     columns: list[jax.Array]  # L^-1 E', each (eq, n, *lanes)
-    theta: list[jax.Array]  # L^-1 p, p = A'W sigma
-    lean: jax.Array | None  # (n, *lanes), what of sigma'W sigma the unknowns of the block cannot make up for
+    theta: list[jax.Array]  # L^-1 p, each (n, *lanes)
+    kappa: jax.Array | None  # (n, *lanes), this block's part of kappa
 
 
 class _Border(NamedTuple):
-    """What a free lambda adds to the reduced Newton system."""
+    """The part of the reduced Newton system that a free lambda adds."""
 
-    inverse: jax.Array  # inverse pivot of lambda
-    column: jax.Array  # (eq, *lanes), lambda's column in the equality rows
+    inverse: jax.Array  # (*lanes), 1 / kappa
+    column: jax.Array  # (eq, *lanes), v
 
 
 class Factors(NamedTuple):
     """The reduced Newton system; `border` is None where lambda is held."""
 
     blocks: list[_BlockFactor]
-    root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of the equality rows' matrix
+    root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of E P^-1 E' + v v'/kappa
     weights: Rows
     border: _Border | None
 
 
 def apply_rows(group: Blocks, x: jax.Array) -> jax.Array:
-    """A x: (k, n, *lanes) -> (m, n, *lanes)."""
-    return fold(jnp.add, spread_over(group.patterns.T, x) * x[:, None])
+    """Compute A x: (k, n, *lanes) -> (m, n, *lanes)."""
+    return matvec_transposed(spread_over(group.patterns.T, x), x)
 
 
 def adjoint_rows(group: Blocks, z: jax.Array) -> jax.Array:
-    """A'z: (m, n, *lanes) -> (k, n, *lanes)."""
-    return fold(jnp.add, spread_over(group.patterns, z) * z[:, None])
+    """Compute A'z: (m, n, *lanes) -> (k, n, *lanes)."""
+    return matvec_transposed(spread_over(group.patterns, z), z)
 
 
 def apply_hessian(group: Blocks, x: jax.Array) -> jax.Array:
-    """H x = root' root x, (k, n, *lanes)."""
-    half = fold(jnp.add, jnp.moveaxis(group.root * x, 1, 0))
-    return fold(jnp.add, group.root * half[:, None])
-
-
-def spread_over(values: jax.Array, like: jax.Array) -> jax.Array:
-    """Append axes, to weigh arrays of which `like` is one along its leading axis."""
-    return values.reshape(values.shape + (1,) * (like.ndim - 1))
+    """Compute H x = root' (root x), (k, n, *lanes)."""
+    product = fold(jnp.add, jnp.moveaxis(group.root * x, 1, 0))
+    return matvec_transposed(group.root, product)
 
 
 def total(x: jax.Array) -> jax.Array:
@@ -121,17 +135,17 @@ def total(x: jax.Array) -> jax.Array:
 
 
 def _over_blocks(x: jax.Array, axis: int) -> jax.Array:
-    """Sum over the axis of blocks."""
+    """Sum over the axis of blocks, which is not the leading one."""
     return fold(jnp.add, jnp.moveaxis(x, axis, 0))
 
 
 def least(x: jax.Array) -> jax.Array:
-    """Smallest over rows and blocks."""
+    """Find the smallest entry over rows and blocks, (m, n, *lanes) -> (*lanes)."""
     return fold(jnp.minimum, fold(jnp.minimum, x))
 
 
 def _substitute_down(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
-    """L^-1 rhs for k <= 3, lists over the unknowns."""
+    """Compute L^-1 rhs for k <= 3; lists run over the unknowns."""
     out: list[jax.Array] = []
     for i, entry in enumerate(rhs):
         for j in range(i):
@@ -141,7 +155,7 @@ def _substitute_down(below: list[jax.Array], inverse: list[jax.Array], rhs: list
 
 
 def _substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
-    """L^-T rhs."""
+    """Compute L^-T rhs for k <= 3; lists run over the unknowns."""
     out = list(rhs)
     for i in reversed(range(len(rhs))):
         for j in range(i + 1, len(rhs)):
@@ -150,63 +164,16 @@ def _substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[j
     return out
 
 
-def inverse_root(matrix: jax.Array, floor: jax.Array | None = None) -> jax.Array:
-    """L^-1 of a symmetric positive definite (eq, eq, *lanes).
-
-    Pivots are clamped at a floor (eq, *lanes), eps of the diagonal. Large matrices are cut in two: L^-1 is made of
-    those of a corner and of what is left of the other one, a third of the work.
-    """
-    size, lanes = matrix.shape[0], matrix.shape[2:]
-    index = jnp.arange(size).reshape(size, *[1] * len(lanes))
-    eye = jnp.eye(size, dtype=matrix.dtype).reshape(size, size, *[1] * len(lanes))
-    least = jnp.finfo(matrix.dtype).eps * fold(jnp.add, eye * matrix) if floor is None else floor
-    if size > _UNDIVIDED:
-        half = size // 2
-        first = inverse_root(matrix[:half, :half], least[:half])
-        across = _times_transposed(matrix[half:, :half], first)
-        last = inverse_root(matrix[half:, half:] - _times_transposed(across, across), least[half:])
-        corner = -_times(last, _times(across, first))
-        zero = jnp.zeros((half, size - half, *lanes), matrix.dtype)
-        return jnp.concatenate([jnp.concatenate([first, zero], 1), jnp.concatenate([corner, last], 1)])
-
-    def eliminate(j: jax.Array, state: tuple) -> tuple:
-        left, root = state
-
-        @fenced
-        def scale(left: jax.Array) -> tuple:
-            inverse = jax.lax.rsqrt(jnp.maximum(left[j, j], least[j]))
-            return inverse, jnp.where(index > j, left[:, j], 0) * (inverse * inverse)
-
-        @fenced
-        def subtract(rows: jax.Array, inverse: jax.Array, shares: jax.Array) -> jax.Array:
-            return jnp.where((index == j)[:, None], rows * inverse, rows - shares[:, None] * rows[j])
-
-        inverse, shares = scale(left)
-        return subtract(left, inverse, shares), subtract(root, inverse, shares)
-
-    return repeat(size, eliminate, (matrix, jnp.broadcast_to(eye, matrix.shape)))[1]
-
-
-@fenced
-def _times(a: jax.Array, b: jax.Array) -> jax.Array:
-    """A B of matrices (r, c, *lanes) and (c, d, *lanes)."""
-    return each(lambda row: fold(jnp.add, [x * y for x, y in zip(row, b, strict=True)]), a)
-
-
-def _times_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
-    """A B' of matrices (r, c, *lanes) and (d, c, *lanes)."""
-    return _times(a, jnp.swapaxes(b, 0, 1))
-
-
 @dataclass(frozen=True)
 class BlockProblem(ABC):
-    """What both programs share.
+    """The constraints and the Newton system that both programs share.
 
-    groups: the blocks.
-    rhs: (eq, *lanes), b; zero in rows that are zero in E.
-    dropped: (eq, *lanes), 1 for the equality rows that are zero, else 0.
-    radius: how |x|_inf at the optimum grows with a negative lambda: at most 1 + radius * max(0, -lambda).
-    refinements: steps of iterative refinement of every Newton direction.
+    groups: the groups of blocks.
+    rhs: the right-hand sides b, (eq, *lanes); zero in rows that are zero in E.
+    dropped: a mask of the equality rows, (eq, *lanes): 1 for rows that are zero, else 0.
+    radius: the growth of |x|_inf at the optimum with a negative lambda: at most 1 + radius * max(0, -lambda).
+    refinements: the number of steps of iterative refinement of every Newton direction.
+    bordered: whether lambda is an unknown (a constant of the class).
     """
 
     groups: tuple[Blocks, ...]
@@ -218,56 +185,61 @@ class BlockProblem(ABC):
 
     @property
     def lanes(self) -> tuple[int, ...]:
-        """Shape of the trailing axes."""
+        """The shape of the trailing axes."""
         return self.rhs.shape[1:]
 
     @property
     def present(self) -> Rows:
-        """1 where a block is there."""
+        """The mask of the blocks of every group: 1 where a block is present."""
         return tuple(g.present for g in self.groups)
 
     @property
     def predictor(self) -> Self:
-        """Without refinement, which changes neither the steps that are taken nor what they end at."""
+        """The problem without refinement: its directions only set the centring, so the loop ends at the same points."""
         return replace(self, refinements=0)
 
     @abstractmethod
     def residuals(self, iterate: Iterate) -> Residuals:
-        """See `interior_point.Problem`."""
+        """Compute the residuals of the optimality conditions."""
 
     @abstractmethod
     def solve(self, factors: Factors, residuals: Residuals, shift: Rows) -> tuple[Any, jax.Array, Rows]:
-        """See `interior_point.Problem`; dx is like the problem's own x."""
+        """Solve the Newton system with dz = shift + weights * (A dx + sigma dlambda) for (dx, dy, change of the rows).
+
+        Like x, dx includes dlambda where lambda is free.
+        """
 
     def equality(self, x: Rows) -> jax.Array:
-        """E x, (eq, *lanes)."""
+        """Compute E x, (eq, *lanes)."""
         products = [g.columns * x_g for g, x_g in zip(self.groups, x, strict=True)]
         return fold(jnp.add, [total(jnp.moveaxis(p, 0, 2)) for p in products])
 
     def pull_back(self, y: jax.Array) -> Rows:
-        """E'y, (k, n, *lanes) a group."""
+        """Compute E'y, (k, n, *lanes) a group."""
         return tuple(fold(jnp.add, g.columns * y[:, None, None]) for g in self.groups)
 
     def project(self, x: Rows) -> Rows:
-        """The nearest point with E x = b, for orthonormal rows."""
+        """Find the nearest point with E x = b, x + E'(b - E x): the rows of E are orthonormal."""
         gap = fenced(lambda x: self.rhs - self.equality(x))(x)
         return tuple(x_g + c for x_g, c in zip(x, self.pull_back(gap), strict=True))
 
     def violations(self, x: Rows, lam: jax.Array) -> jax.Array:
-        """Largest amount by which any row is missed, (*lanes)."""
-        missed = fold(jnp.maximum, jnp.abs(self.equality(x) - self.rhs))
+        """Compute the largest amount by which a point misses any row, (*lanes)."""
+        violation = fold(jnp.maximum, jnp.abs(self.equality(x) - self.rhs))
         for g, x_g in zip(self.groups, x, strict=True):
-            missed = jnp.maximum(missed, -least(g.h - apply_rows(g, x_g) - g.sigma * lam))
-        return missed
+            violation = jnp.maximum(violation, -least(g.h - apply_rows(g, x_g) - g.sigma * lam))
+        return violation
 
     def first_multipliers(self) -> tuple[jax.Array, Rows]:
-        """Nothing, for a record."""
+        """Make the multipliers y and z of the record before the first step: zeros."""
         return jnp.zeros_like(self.rhs), tuple(jnp.zeros_like(g.sigma) for g in self.groups)
 
     def factor(self, weights: Rows) -> Factors:
-        """Eliminate blocks, then lambda."""
+        """Factor the Newton system for weights z/s: eliminate the blocks, then lambda."""
+        # Blocks: L L' = P, with theta = L^-1 p and L^-1 E'.
         blocks = [self._factor_block(g, w) for g, w in zip(self.groups, weights, strict=True)]
 
+        # Equality rows and lambda: E P^-1 E', v = -E P^-1 p and 1 / kappa.
         @fenced
         def reduce(blocks: list[_BlockFactor]) -> tuple:
             columns = [f.columns for f in blocks]
@@ -278,11 +250,11 @@ class BlockProblem(ABC):
             matrix = each(row, jnp.arange(self.rhs.shape[0]))
             if not self.bordered:
                 return matrix, None, None
-            sides = [_over_blocks(c * -t, 1) for f in blocks for c, t in zip(f.columns, f.theta, strict=True)]
-            # A sum of squares: sigma'W sigma - p'P^-1 p would cancel near the optimum.
-            kappa = fold(jnp.add, [fold(jnp.add, f.lean) for f in blocks if f.lean is not None])
-            return matrix, fold(jnp.add, sides), 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
+            terms = [_over_blocks(c * -t, 1) for f in blocks for c, t in zip(f.columns, f.theta, strict=True)]
+            kappa = fold(jnp.add, [fold(jnp.add, f.kappa) for f in blocks if f.kappa is not None])
+            return matrix, fold(jnp.add, terms), 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
 
+        # Eliminate lambda: E P^-1 E' + v v'/kappa, with ones on the diagonal of dropped rows.
         @fenced
         def complete(matrix: jax.Array, v: jax.Array | None, inverse: jax.Array | None) -> jax.Array:
             eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(*matrix.shape[:2], *[1] * len(self.lanes))
@@ -291,52 +263,56 @@ class BlockProblem(ABC):
 
         matrix, v, inverse = reduce(blocks)
         border = _Border(inverse, v) if self.bordered else None
-        return Factors(blocks, inverse_root(complete(matrix, v, inverse)), weights, border)
+        return Factors(blocks, inverse_cholesky(complete(matrix, v, inverse)), weights, border)
 
     def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
-        """Orthogonalise [A, sigma] column by column, in the inner product that the weights give.
+        """Make the columns of [A, sigma] orthogonal in the inner product of W, by modified Gram-Schmidt.
 
-        A'WA itself would square its condition, too much for float32.
+        P = A'W A itself would square the condition, too much for float32.
         """
         k = g.patterns.shape[1]
         columns = [jnp.broadcast_to(spread_over(g.patterns[:, a], weights), weights.shape) for a in range(k)]
-        if g.hessian is not None:
-            columns = [jnp.concatenate([c, g.hessian[:, a]]) for a, c in enumerate(columns)]
-            weights = jnp.concatenate([weights, jnp.ones_like(g.hessian[:, 0])])
+        if g.hessian_root is not None:
+            # A root of H below A gives P = A'W A + H.
+            columns = [jnp.concatenate([c, g.hessian_root[:, a]]) for a, c in enumerate(columns)]
+            weights = jnp.concatenate([weights, jnp.ones_like(g.hessian_root[:, 0])])
         if self.bordered:
             columns.append(g.sigma)
 
         @fenced
-        def share(weights: jax.Array, column: jax.Array, others: list[jax.Array]) -> tuple:
-            pulled = weights * column
-            square = fold(jnp.add, pulled * column)
+        def project(weights: jax.Array, column: jax.Array, others: list[jax.Array]) -> tuple:
+            """Compute 1 / |column| and the components of the other columns along it: a column of L."""
+            weighted = weights * column
+            square = fold(jnp.add, weighted * column)
             inverse = jax.lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny) + (1 - g.present))
-            return inverse, [fold(jnp.add, pulled * other) * inverse for other in others]
+            return inverse, [fold(jnp.add, weighted * other) * inverse for other in others]
 
         @fenced
-        def remove(column: jax.Array, inverse: jax.Array, others: list[jax.Array], shares: list[jax.Array]) -> list:
+        def remove(column: jax.Array, inverse: jax.Array, others: list[jax.Array], components: list[jax.Array]) -> list:
             unit = column * inverse
-            return [other - part * unit for other, part in zip(others, shares, strict=True)]
+            return [other - component * unit for other, component in zip(others, components, strict=True)]
 
-        inverse, shares = [], []
+        inverse, components = [], []
         for _ in range(k):
             column, *others = columns
-            own, parts = share(weights, column, others)
-            columns = remove(column, own, others, parts)
-            inverse.append(own)
-            shares.append(parts)
-        below = [shares[j][i - j - 1] for i in range(k) for j in range(i)]
-        theta = [parts[-1] for parts in shares] if self.bordered else []
-        lean = fenced(lambda w, c: fold(jnp.add, w * c * c))(weights, columns[0]) if self.bordered else None
+            inverse_length, along = project(weights, column, others)
+            columns = remove(column, inverse_length, others, along)
+            inverse.append(inverse_length)
+            components.append(along)
+        below = [components[j][i - j - 1] for i in range(k) for j in range(i)]
+        theta = [along[-1] for along in components] if self.bordered else []
+        # The remaining column is sigma's, and its square is kappa.
+        kappa = fenced(lambda w, c: fold(jnp.add, w * c * c))(weights, columns[0]) if self.bordered else None
         reduced = fenced(lambda below, inverse: _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
-        return _BlockFactor(below, inverse, reduced(below, inverse), theta, lean)
+        return _BlockFactor(below, inverse, reduced(below, inverse), theta, kappa)
 
     def newton(self, factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
-        """Solve [P p E'; p' hll 0; E 0 0] (dx, dlambda, dy) = (rhs_x, rhs_lambda, rhs_y).
+        """Solve the system of this module's docstring for (dx, dlambda, dy).
 
-        rhs_lambda and dlambda are None where lambda is held.
+        Where lambda is held, rhs_lambda and dlambda are None.
         """
 
+        # Eliminate the blocks: L^-1 r_x, E P^-1 r_x - r_y and r_lambda - p'P^-1 r_x.
         @fenced
         def eliminate(factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
             reduced = [
@@ -352,27 +328,30 @@ class BlockProblem(ABC):
                 return reduced, right, None
             return reduced, right, rhs_lambda - fold(jnp.add, [fold(jnp.add, t * a) for _, t, a in pairs])
 
+        # Eliminate lambda, and solve the equality rows for dy in two halves: root'(root right).
         @fenced
         def solve_equalities(factors: Factors, right: jax.Array, pull: jax.Array | None) -> jax.Array:
             if factors.border is not None and pull is not None:
                 right = right + factors.border.column * (pull * factors.border.inverse)
             return fold(jnp.add, jnp.moveaxis(factors.root * right, 1, 0))
 
+        # Then dlambda = (r_lambda - p'P^-1 r_x - v'dy) / kappa.
         @fenced
-        def finish_equalities(factors: Factors, half: jax.Array, pull: jax.Array | None) -> tuple:
-            dy = fold(jnp.add, factors.root * half[:, None])
+        def finish_equalities(factors: Factors, root_right: jax.Array, pull: jax.Array | None) -> tuple:
+            dy = matvec_transposed(factors.root, root_right)
             if factors.border is None or pull is None:
                 return dy, None
             return dy, (pull - fold(jnp.add, factors.border.column * dy)) * factors.border.inverse
 
+        # Substitute: dx = L^-T (L^-1 r_x - L^-1 E'dy - theta dlambda).
         @fenced
         def substitute(factors: Factors, reduced: list, dy: jax.Array, dlambda: jax.Array | None) -> Rows:
             out = []
             for f, r in zip(factors.blocks, reduced, strict=True):
-                left = [a - fold(jnp.add, c * dy[:, None]) for c, a in zip(f.columns, r, strict=True)]
+                right = [a - fold(jnp.add, c * dy[:, None]) for c, a in zip(f.columns, r, strict=True)]
                 if dlambda is not None:
-                    left = [a - t * dlambda for a, t in zip(left, f.theta, strict=True)]
-                out.append(jnp.stack(_substitute_up(f.below, f.inverse, left)))
+                    right = [a - t * dlambda for a, t in zip(right, f.theta, strict=True)]
+                out.append(jnp.stack(_substitute_up(f.below, f.inverse, right)))
             return tuple(out)
 
         reduced, right, pull = eliminate(factors, rhs_x, rhs_lambda, rhs_y)

@@ -1,12 +1,22 @@
 """The homogeneous self-dual embedding of a conic margin program, in lanes.
 
-One loop of predictor-corrector steps with Nesterov's and Todd's scaling finds an optimum, or a certificate that nothing
-is admissible; it starts at no admissible point. Blocks are eliminated first, then the equalities, then lambda.
+The program is max lambda over A x + sigma lambda + s = h, E x + w lambda = b, s in K, with multipliers z in K and y.
+With tau and kappa >= 0 beside the unknowns, the embedding asks for
+
+    A'z + E'y = 0,    sigma'z + w'y = tau,                   (stationarity in x and lambda)
+    b tau - E x - w lambda = 0,    s + A x + sigma lambda - h tau = 0,
+    kappa - lambda + b'y + h'z = 0,    s o z = 0,    tau kappa = 0.
+
+Zero always solves it. Where tau > 0, (x, lambda, s, y, z)/tau is optimal; where kappa > 0 with h'z + b'y < 0, (y, z)
+proves that nothing is admissible. So the loop needs no admissible point to start from.
+
+A predictor and a corrector with Nesterov's and Todd's scaling make a step; `kkt` solves their Newton systems.
 
 Sources: Vandenberghe (2010), "The CVXOPT linear and quadratic cone program solvers", sections 4 and 7; Andersen, Roos
 and Terlaky (2003), "On implementing a primal-dual interior-point method for conic quadratic optimization".
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,32 +26,28 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced, repeat
-from jaxgrasp.solvers.block.kkt import inverse_root
-from jaxgrasp.solvers.conic import cones
+from jaxgrasp.solvers.conic import cones, kkt
 from jaxgrasp.solvers.conic.cones import Scaling
-from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, Parts, inner, most, over_blocks, reduce
-from jaxgrasp.solvers.small_matrices import back, cholesky, down
+from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, Parts, inner, largest_entry, reduce
 
 _MAX_ITERATIONS = 60
 _PATIENCE = 6
-# What counts as progress of the upper bound.
+# A relative fall of the upper bound by this much counts as progress.
 _FALL = 1e-4
-# Share of the way to the boundary.
+# A step goes this share of the way to the boundary.
 _STEP = 0.98
-# Steps of iterative refinement of every Newton direction.
-_REFINEMENTS = 1
 
 
 class ConicOutcome(NamedTuple):
-    """The best point; (*lanes) each.
+    """The best point and the best certificates that the loop met; all but the point are (*lanes).
 
-    point: the best one found.
-    upper: certified: no admissible point has a larger lambda (for lambda >= 0).
-    error: of `point`, the largest of its residuals and its gap, relative.
-    infeasible: bool, there is a certificate that no point is admissible.
-    certificate: how far the best one is from being exact; inf where there is none at all.
-    residual: how far `point` misses rows and equalities.
-    iterations: steps taken.
+    point: the best point.
+    upper: a certified bound: no admissible point has a larger lambda (for lambda >= 0).
+    error: the largest of the residuals of `point` and its gap, relative.
+    infeasible: bool, whether a certificate shows that no point is admissible.
+    certificate: the relative error of the best such certificate; inf where there is none at all.
+    residual: the largest amount by which `point` misses rows and equalities.
+    iterations: the number of steps taken.
     """
 
     point: ConicPoint
@@ -54,6 +60,8 @@ class ConicOutcome(NamedTuple):
 
 
 class _State(NamedTuple):
+    """The unknowns of the embedding."""
+
     x: jax.Array
     lam: jax.Array
     y: jax.Array
@@ -64,19 +72,13 @@ class _State(NamedTuple):
 
 
 class _Residuals(NamedTuple):
+    """The residuals of the embedding's equations, each named after the unknown that it is as large as."""
+
     x: jax.Array
     lam: jax.Array
     y: jax.Array
     rows: Parts
     tau: jax.Array
-
-
-class _Factors(NamedTuple):
-    lower: list[jax.Array]
-    phi: jax.Array
-    root: jax.Array
-    v: jax.Array
-    pivot: jax.Array
 
 
 class _Carry(NamedTuple):
@@ -89,12 +91,12 @@ class _Carry(NamedTuple):
 
 
 def solve(problem: ConicMargin, tolerance: float, active: jax.Array) -> ConicOutcome:
-    """Solve until every active lane is done; others are not touched.
+    """Solve until every active lane is done.
 
     Args:
-        problem: what to solve.
-        tolerance: largest relative residual and gap.
-        active: bool (*lanes).
+        problem: the problem to solve.
+        tolerance: the largest relative residual and gap of an optimum, and the largest error of a certificate.
+        active: bool (*lanes); the loop does not touch lanes that are False.
     """
     lanes, dtype = problem.rhs.shape[1:], problem.rhs.dtype
     shapes = [part.sigma.shape for part in problem.rows]
@@ -102,6 +104,7 @@ def solve(problem: ConicMargin, tolerance: float, active: jax.Array) -> ConicOut
         cones.identity_like(part.second_order, jnp.ones(shape, dtype))
         for part, shape in zip(problem.rows, shapes, strict=True)
     )
+    # Start at the identity of every cone; the degree counts the pairs that share mu.
     one, zero = jnp.ones(lanes, dtype), jnp.zeros(lanes, dtype)
     x, y = jnp.zeros((*problem.columns.shape[1:3], *lanes), dtype), jnp.zeros_like(problem.rhs)
     state = _State(x, zero, y, units, units, one, one)
@@ -121,18 +124,20 @@ def solve(problem: ConicMargin, tolerance: float, active: jax.Array) -> ConicOut
 
     def body(carry: _Carry) -> _Carry:
         stepped = _step(problem, carry.state, carry.residuals, units, degree)
-        fine = carry.active & jnp.isfinite(_total(stepped))
-        state = _where(fine, stepped, carry.state)
+        is_usable = carry.active & jnp.isfinite(_total(stepped))
+        state = _where(is_usable, stepped, carry.state)
         residuals = _residuals(problem, state)
-        found = _assessed(problem, state, residuals, carry.best, tolerance)
-        better = (found.error < 0.9 * carry.best.error) | (found.certificate < 0.9 * carry.best.certificate)
+
+        # Freeze the lanes that are solved or make no progress.
+        assessed = _assess(problem, state, residuals, carry.best, tolerance)
+        better = (assessed.error < 0.9 * carry.best.error) | (assessed.certificate < 0.9 * carry.best.certificate)
         # Where nothing is strictly inside the cones, points that miss them by little can promise much; the bound then
         # comes down, over a dozen steps, before they get any better.
-        better |= carry.best.upper - found.upper > _FALL * jnp.maximum(1, jnp.abs(found.upper))
-        found = found._replace(iterations=carry.best.iterations + 1)
-        best = _where(carry.active, found, carry.best)
+        better |= carry.best.upper - assessed.upper > _FALL * jnp.maximum(1, jnp.abs(assessed.upper))
+        assessed = assessed._replace(iterations=carry.best.iterations + 1)
+        best = _where(carry.active, assessed, carry.best)
         stalled = jnp.where(better, 0, carry.stalled + 1)
-        done = (best.error <= tolerance) | best.infeasible | (stalled >= _PATIENCE) | ~fine
+        done = (best.error <= tolerance) | best.infeasible | (stalled >= _PATIENCE) | ~is_usable
         return _Carry(state, residuals, best, stalled, carry.active & ~done, carry.step + 1)
 
     first = _Carry(
@@ -142,10 +147,11 @@ def solve(problem: ConicMargin, tolerance: float, active: jax.Array) -> ConicOut
 
 
 @fenced
-def _assessed(problem: ConicMargin, state: _State, r: _Residuals, best: ConicOutcome, tolerance: float) -> ConicOutcome:
-    """The best point with this one taken into account."""
+def _assess(problem: ConicMargin, state: _State, r: _Residuals, best: ConicOutcome, tolerance: float) -> ConicOutcome:
+    """Update the best point and the certificates with this state."""
+    # The point (x, lambda, y, z) / tau, and its residuals and gap.
     inverse = 1 / state.tau
-    primal = jnp.maximum(fold(jnp.maximum, jnp.abs(r.y)), most([jnp.abs(v) for v in r.rows])) * inverse
+    primal = jnp.maximum(fold(jnp.maximum, jnp.abs(r.y)), largest_entry([jnp.abs(v) for v in r.rows])) * inverse
     dual = jnp.maximum(fold(jnp.maximum, fold(jnp.maximum, jnp.abs(r.x))), jnp.abs(r.lam)) * inverse
     value = fold(jnp.add, problem.rhs * state.y) + inner([part.sides() for part in problem.rows], state.z)
     lam, bound = state.lam * inverse, value * inverse
@@ -157,7 +163,7 @@ def _assessed(problem: ConicMargin, state: _State, r: _Residuals, best: ConicOut
     pull = r.lam + state.tau
     radius = 1 + 3 * jnp.maximum(0, -lam)
     upper = jnp.where(pull > 0, (value + radius * lost) / jnp.where(pull > 0, pull, 1), jnp.inf)
-    # With nothing on the right, (y, z) excludes every x with |x|_inf <= 1, whatever lambda is.
+    # With a right-hand side of 0, (y, z) excludes every x with |x|_inf <= 1, whatever lambda is.
     size = jnp.maximum(1e-30, -value)
     certificate = jnp.where(value < 0, (lost + jnp.abs(pull)) / size, jnp.inf)
     certificate = jnp.where(jnp.isfinite(certificate), jnp.minimum(best.certificate, certificate), best.certificate)
@@ -176,6 +182,7 @@ def _assessed(problem: ConicMargin, state: _State, r: _Residuals, best: ConicOut
 
 @fenced
 def _residuals(problem: ConicMargin, state: _State) -> _Residuals:
+    """Compute the residuals of the embedding's equations."""
     pulled, along = problem.adjoint(state.z)
     value = fold(jnp.add, problem.rhs * state.y) + inner([part.sides() for part in problem.rows], state.z)
     lhs = problem.apply(state.x, state.lam)
@@ -189,177 +196,132 @@ def _residuals(problem: ConicMargin, state: _State) -> _Residuals:
 
 
 def _step(problem: ConicMargin, state: _State, residuals: _Residuals, units: Parts, degree: float) -> _State:
-    """A predictor, a corrector, and a step along it.
+    """Take a step along the corrector's direction.
 
-    Directions are a solution for the residuals plus dtau times one for the constants (c, b, h): three solves, in a loop
-    so that the program has each of them once.
+    A direction is a solution of the Newton system for the residuals plus dtau times one for the constants (c, b, h).
+    The three solves (constants, predictor, corrector) are rounds of one loop, so that the program has the system once.
     """
     kinds = [part.second_order for part in problem.rows]
 
+    # Scale, W^-1 s = W z = lambda, and factor the Newton system.
     @fenced
     def scale(s: Parts, z: Parts) -> tuple:
         scalings = tuple(cones.scaling(kind, s_p, z_p) for kind, s_p, z_p in zip(kinds, s, z, strict=True))
         return scalings, (inner(s, z) + state.tau * state.kappa) / degree
 
     scalings, mu = scale(state.s, state.z)
-    factors = _factor(problem, scalings)
+    factors = kkt.factor(problem, scalings)
+    right_sides = fenced(partial(_right_sides, problem, residuals, scalings))
+    combine = fenced(partial(_combine, problem, state, residuals, scalings))
+    aim_at = fenced(partial(_aim, kinds, state, scalings, mu, units))
 
-    @fenced
-    def right_sides(i: jax.Array, remaining: jax.Array, aims: Parts) -> tuple:
-        first = i == 0
-        sides = tuple(
-            jnp.where(first, -part.sides(), remaining * r + cones.stretch(w, a))
-            for part, r, w, a in zip(problem.rows, residuals.rows, scalings, aims, strict=True)
-        )
-        rhs_lam = jnp.where(first, 1, -remaining * residuals.lam)
-        return -remaining * residuals.x, rhs_lam, jnp.where(first, problem.rhs, remaining * residuals.y), sides
-
-    @fenced
-    def combine(
-        own: tuple, constant: tuple, bend: jax.Array, remaining: jax.Array, aims: Parts, aim: jax.Array
-    ) -> tuple:
-        _, _, y, z, _ = own
-        value = fold(jnp.add, problem.rhs * y) + inner([part.sides() for part in problem.rows], z)
-        lacking = remaining * residuals.tau + aim / state.tau - own[1] + value
-        dtau = lacking / (state.kappa / state.tau + bend)
-        x, lam, y, z, rows = jax.tree.map(lambda a, c: a + dtau * c, own, constant)
-        # From the rows, so that these are met whatever rounding does to W: lambda-wise it is aims - W dz.
-        s = tuple(cones.stretch(w, a) - r for w, a, r in zip(scalings, aims, rows, strict=True))
-        scaled = tuple(cones.stretch(w, d) for w, d in zip(scalings, z, strict=True))
-        slack = tuple(cones.shrink(w, d) for w, d in zip(scalings, s, strict=True))
-        dkappa = (aim - state.kappa * dtau) / state.tau
-        over = [most([cones.overshoot(w, d)]) for w, d in zip(scalings * 2, slack + scaled, strict=True)]
-        over = fold(jnp.maximum, [*over, -dtau / state.tau, -dkappa / state.kappa])
-        return _State(x, lam, y, s, z, dtau, dkappa), slack, scaled, over
-
-    @fenced
-    def correct(i: jax.Array, direction: _State, slack: Parts, scaled: Parts, over: jax.Array) -> tuple:
-        """What the next direction aims at, d_s divided by lambda and d_kappa: after the constants, the boundary."""
-        first = i == 0
-        centring = jnp.where(first, 0, (1 - 1 / jnp.maximum(over, 1)) ** 3)
-        second = jnp.where(first, 0, 1)
-        aims = tuple(
-            cones.quotient(w, centring * mu * e - second * cones.product(kind, a, b)) - w.value
-            for kind, w, a, b, e in zip(kinds, scalings, slack, scaled, units, strict=True)
-        )
-        aim = centring * mu - state.tau * state.kappa - second * direction.tau * direction.kappa
-        return 1 - centring, aims, aim
-
-    def phase(i: jax.Array, carry: tuple) -> tuple:
+    # Solve for the constants, the predictor and the corrector, in this order.
+    def solve(i: jax.Array, carry: tuple) -> tuple:
         constant, bend, (remaining, aims, aim), _, _ = carry
-        own = _newton(problem, scalings, factors, *right_sides(i, remaining, aims))
-        constant = _where(i == 0, own, constant)
+        solution = kkt.newton(problem, scalings, factors, *right_sides(i, remaining, aims))
+        constant = _where(i == 0, solution, constant)
         # = lambda_1 - b'y_1 - h'z_1, without its cancellation.
-        bend = jnp.where(i == 0, fenced(inner)(own[4], own[3]), bend)
-        direction, slack, scaled, over = combine(own, constant, bend, remaining, aims, aim)
-        return constant, bend, correct(i, direction, slack, scaled, over), direction, over
+        bend = jnp.where(i == 0, fenced(inner)(solution[4], solution[3]), bend)
+        direction, slack, scaled, overshoot = combine(solution, constant, bend, remaining, aims, aim)
+        return constant, bend, aim_at(i, direction, slack, scaled, overshoot), direction, overshoot
 
     zero = jnp.zeros_like(state.lam)
     nothing = jax.tree.map(jnp.zeros_like, state)
     start = (nothing.x, zero, nothing.y, nothing.z, nothing.s), zero, (zero, nothing.s, zero), nothing, zero
-    *_, direction, over = repeat(3, phase, start)
+    *_, direction, overshoot = repeat(3, solve, start)
 
+    # Go a fixed share of the way to the boundary.
     @fenced
-    def advance(state: _State, direction: _State, over: jax.Array) -> _State:
-        alpha = _STEP / jnp.maximum(over, _STEP)
+    def advance(state: _State, direction: _State, overshoot: jax.Array) -> _State:
+        alpha = _STEP / jnp.maximum(overshoot, _STEP)
         return jax.tree.map(lambda a, d: a + alpha * d, state, direction)
 
-    return advance(state, direction, over)
+    return advance(state, direction, overshoot)
 
 
-def _factor(problem: ConicMargin, scalings: tuple[Scaling, ...]) -> _Factors:
-    """Eliminate blocks, then the equalities, then lambda."""
-
-    @fenced
-    def blocks(scalings: tuple[Scaling, ...]) -> tuple:
-        grams = [part.gram(w) for part, w in zip(problem.rows, scalings, strict=True)]
-        lower = cholesky([fold(jnp.add, list(entries)) for entries in zip(*grams, strict=True)])
-        sigma = tuple(part.sigma for part in problem.rows)
-        weighed = tuple(cones.weigh(w, v) for w, v in zip(scalings, sigma, strict=True))
-        return lower, back(lower, problem.adjoint(weighed)[0])
-
-    lower, phi = blocks(scalings)
-
-    @fenced
-    def equalities(lower: list[jax.Array], phi: jax.Array) -> tuple:
-        reduced = down(lower, jnp.moveaxis(problem.columns, 1, 0))
-        matrix = jnp.stack(
-            [over_blocks(jnp.swapaxes(reduced * reduced[:, r][:, None], 0, 1)) for r in range(len(problem.rhs))]
-        )
-        eye = jnp.eye(len(problem.rhs), dtype=phi.dtype).reshape(*matrix.shape[:2], *[1] * (problem.rhs.ndim - 1))
-        # What of sigma the blocks cannot make up for; as a difference of squares it would cancel.
-        rest = [part.sigma - part.apply(phi) for part in problem.rows]
-        lean = inner(*[[cones.shrink(w, v) for w, v in zip(scalings, rest, strict=True)]] * 2)
-        return matrix + eye * problem.dropped, problem.border - over_blocks(problem.columns * phi), lean
-
-    matrix, v, lean = equalities(lower, phi)
-    root = inverse_root(matrix)
-    half = fenced(_times)(root, v)
-    pivot = lean + fold(jnp.add, half * half)
-    return _Factors(lower, phi, root, v, pivot)
-
-
-def _newton(
+def _right_sides(
     problem: ConicMargin,
+    residuals: _Residuals,
     scalings: tuple[Scaling, ...],
-    factors: _Factors,
-    rhs_x: jax.Array,
-    rhs_lam: jax.Array,
-    rhs_y: jax.Array,
-    sides: Parts,
+    i: jax.Array,
+    remaining: jax.Array,
+    aims: Parts,
 ) -> tuple:
-    """Newton's system: x, lambda, y, z and the rows r = A x + sigma lambda + sides.
+    """Form the right-hand sides of `kkt.newton`: (c, b, h) in round 0, then the remaining share of the residuals."""
+    is_constant = i == 0
+    sides = tuple(
+        jnp.where(is_constant, -part.sides(), remaining * r + cones.stretch(w, a))
+        for part, r, w, a in zip(problem.rows, residuals.rows, scalings, aims, strict=True)
+    )
+    rhs_lam = jnp.where(is_constant, 1, -remaining * residuals.lam)
+    return -remaining * residuals.x, rhs_lam, jnp.where(is_constant, problem.rhs, remaining * residuals.y), sides
 
-    With z = W^-2 r: A'z + E'y = rhs_x, sigma'z + w'y = rhs_lam, E x + w lambda = rhs_y.
+
+def _combine(
+    problem: ConicMargin,
+    state: _State,
+    residuals: _Residuals,
+    scalings: tuple[Scaling, ...],
+    solution: tuple,
+    constant: tuple,
+    bend: jax.Array,
+    remaining: jax.Array,
+    aims: Parts,
+    aim: jax.Array,
+) -> tuple:
+    """Combine both solutions to a direction; dtau follows from the rows of tau and kappa.
+
+    Returns:
+        The direction, W^-1 ds and W dz, and the reciprocal of the step that reaches the boundary.
     """
-
-    @fenced
-    def without_sides(rhs_x: jax.Array, rhs_lam: jax.Array, sides: Parts) -> tuple:
-        pulled, along = problem.adjoint(tuple(cones.weigh(w, u) for w, u in zip(scalings, sides, strict=True)))
-        return rhs_x - pulled, rhs_lam - along
-
-    @fenced
-    def eliminate(right: jax.Array, right_lam: jax.Array, rhs_y: jax.Array) -> tuple:
-        first = back(factors.lower, right)
-        half = _times(factors.root, over_blocks(problem.columns * first) - rhs_y)
-        across = _times(factors.root, factors.v)
-        lam = right_lam - fold(jnp.add, fold(jnp.add, factors.phi * right)) - fold(jnp.add, across * half)
-        lam = lam / jnp.maximum(factors.pivot, jnp.finfo(lam.dtype).tiny)
-        y = fold(jnp.add, factors.root * (half + across * lam)[:, None])
-        x = first - factors.phi * lam - back(factors.lower, problem.pull_back(y))
-        return x, lam, y
-
-    @fenced
-    def rows(x: jax.Array, lam: jax.Array, sides: Parts) -> tuple:
-        lhs = tuple(a + u for a, u in zip(problem.apply(x, lam), sides, strict=True))
-        return lhs, tuple(cones.weigh(w, v) for w, v in zip(scalings, lhs, strict=True))
-
-    @fenced
-    def lacking(x: jax.Array, lam: jax.Array, y: jax.Array, z: Parts) -> tuple:
-        pulled, along = problem.adjoint(z)
-        own_lam = rhs_lam - along - fold(jnp.add, problem.border * y)
-        return rhs_x - pulled - problem.pull_back(y), own_lam, rhs_y - problem.equality(x, lam)
-
-    def improve(_: jax.Array, carry: tuple) -> tuple:
-        (x, lam, y), right, lhs, z, sides = carry
-        more = eliminate(*right)
-        more_lhs, more_z = rows(more[0], more[1], sides)
-        x, lam, y, lhs, z = jax.tree.map(jnp.add, (x, lam, y, lhs, z), (*more, more_lhs, more_z))
-        return (x, lam, y), lacking(x, lam, y, z), lhs, z, jax.tree.map(jnp.zeros_like, sides)
-
-    nothing = jnp.zeros_like(rhs_x), jnp.zeros_like(rhs_lam), jnp.zeros_like(rhs_y)
-    none = jax.tree.map(jnp.zeros_like, sides)
-    start = nothing, (*without_sides(rhs_x, rhs_lam, sides), rhs_y), none, none, sides
-    (x, lam, y), _, lhs, z, _ = repeat(1 + _REFINEMENTS, improve, start)
-    return x, lam, y, z, lhs
+    _, _, y, z, _ = solution
+    value = fold(jnp.add, problem.rhs * y) + inner([part.sides() for part in problem.rows], z)
+    residual = remaining * residuals.tau + aim / state.tau - solution[1] + value
+    dtau = residual / (state.kappa / state.tau + bend)
+    x, lam, y, z, rows = jax.tree.map(lambda a, c: a + dtau * c, solution, constant)
+    # From the rows, so that these are met whatever rounding does to W: lambda-wise it is aims - W dz.
+    s = tuple(cones.stretch(w, a) - r for w, a, r in zip(scalings, aims, rows, strict=True))
+    scaled = tuple(cones.stretch(w, d) for w, d in zip(scalings, z, strict=True))
+    slack = tuple(cones.shrink(w, d) for w, d in zip(scalings, s, strict=True))
+    dkappa = (aim - state.kappa * dtau) / state.tau
+    overshoots = [largest_entry([cones.overshoot(w, d)]) for w, d in zip(scalings * 2, slack + scaled, strict=True)]
+    overshoot = fold(jnp.maximum, [*overshoots, -dtau / state.tau, -dkappa / state.kappa])
+    return _State(x, lam, y, s, z, dtau, dkappa), slack, scaled, overshoot
 
 
-def _times(matrix: jax.Array, v: jax.Array) -> jax.Array:
-    return fold(jnp.add, jnp.swapaxes(matrix, 0, 1) * v[:, None])
+def _aim(
+    kinds: list[bool],
+    state: _State,
+    scalings: tuple[Scaling, ...],
+    mu: jax.Array,
+    units: Parts,
+    i: jax.Array,
+    direction: _State,
+    slack: Parts,
+    scaled: Parts,
+    overshoot: jax.Array,
+) -> tuple:
+    """Choose what the next direction aims at: after the constants the boundary, after the predictor sigma mu.
+
+    In the scaled space a direction solves lambda o (W^-1 ds + W dz) = sigma mu e - lambda o lambda - second order.
+
+    Returns:
+        The share 1 - sigma of the residuals, d_s divided by lambda, and d_kappa.
+    """
+    is_constant = i == 0
+    # Mehrotra's sigma = (1 - alpha)^3, with the predictor's step alpha to the boundary.
+    sigma = jnp.where(is_constant, 0, (1 - 1 / jnp.maximum(overshoot, 1)) ** 3)
+    second = jnp.where(is_constant, 0, 1)
+    aims = tuple(
+        cones.quotient(w, sigma * mu * e - second * cones.product(kind, a, b)) - w.value
+        for kind, w, a, b, e in zip(kinds, scalings, slack, scaled, units, strict=True)
+    )
+    aim = sigma * mu - state.tau * state.kappa - second * direction.tau * direction.kappa
+    return 1 - sigma, aims, aim
 
 
 def _total(state: _State) -> jax.Array:
-    """Sum of everything, (*lanes): not finite where anything is not."""
+    """Sum all unknowns, (*lanes): the sum is not finite where any of them is not."""
     sums = [fold(jnp.add, fold(jnp.add, state.x)), state.lam, fold(jnp.add, state.y), state.tau, state.kappa]
     return fold(jnp.add, [*sums, *(reduce(jnp.add, v) for v in (*state.s, *state.z))])
 

@@ -5,8 +5,8 @@ With blocks x_i of three unknowns, a scalar lambda, and for every block the same
     h - A x_i - sigma_ij lambda in K      for every block i and copy j = 1 .. J,
     sum_i E_i x_i + w lambda = b          (a few equality rows),
 
-where K is a product of orthants and second-order cones. `embedding.solve` solves it. Copies only add up in the 3x3
-matrices of the blocks, so a step costs O(n (J + 1)), whatever couples the copies.
+where K is a product of orthants and second-order cones. `embedding.solve` solves it. All copies of a block's rows have
+the same x_i, so they only add up in its 3x3 matrix, and a step costs O(n (J + 1)).
 
 Callers scale: |x| <= 1 at admissible points with lambda >= 0, rows of E orthonormal or zero, sigma or w about 1.
 """
@@ -19,58 +19,60 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.solvers.block.kkt import spread_over
 from jaxgrasp.solvers.conic import cones
 from jaxgrasp.solvers.conic.cones import Scaling
+from jaxgrasp.solvers.small_matrices import matvec_transposed, spread_over, sum_over_blocks
 
 Parts = tuple[jax.Array, ...]
 # Axes up to this length are reduced term by term.
-_SPELT_OUT = 16
+_LONGEST_FOLDED = 16
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class ConeRows:
-    """Rows of one kind of cone, the same for every block and copy but for sigma; lanes trail."""
+    """Rows of one kind of cone; only sigma differs between blocks and copies; lanes trail."""
 
     second_order: bool = field(metadata={"static": True})
+    """Whether the rows of a block and copy are one second-order cone, or an orthant."""
     patterns: tuple[tuple[float, ...], ...] = field(metadata={"static": True})
-    """(d, 3), A."""
+    """The rows A, (d, 3)."""
     h: tuple[float, ...] = field(metadata={"static": True})
-    """(d,), right-hand sides."""
+    """The right-hand sides h, (d,)."""
     sigma: jax.Array
-    """(d, J, n, *lanes), zero where absent."""
+    """The column of lambda, (d, J, n, *lanes); zero where a block is absent."""
     stretch: jax.Array | None = None
-    """(3, n, *lanes), what the columns of A are multiplied by; None for 1."""
+    """Factors of the columns of A, (3, n, *lanes); None for 1."""
 
     def apply(self, x: jax.Array) -> jax.Array:
-        """A x: (3, n, *lanes) -> (d, 1, n, *lanes), the same for all copies."""
+        """Compute A x, which all copies share: (3, n, *lanes) -> (d, 1, n, *lanes)."""
         x = x if self.stretch is None else self.stretch * x
-        return fold(jnp.add, spread_over(self._matrix().T, x) * x[:, None])[:, None]
+        return matvec_transposed(spread_over(self._matrix().T, x), x)[:, None]
 
     def adjoint(self, z: jax.Array) -> jax.Array:
-        """A'z summed over copies: (d, J, n, *lanes) -> (3, n, *lanes)."""
+        """Compute A'z, summed over copies: (d, J, n, *lanes) -> (3, n, *lanes)."""
         z = along(jnp.add, jnp.moveaxis(z, 1, 0))
-        pulled = fold(jnp.add, spread_over(self._matrix(), z) * z[:, None])
+        pulled = matvec_transposed(spread_over(self._matrix(), z), z)
         return pulled if self.stretch is None else self.stretch * pulled
 
     def sides(self) -> jax.Array:
-        """h, (d, 1, 1, *1)."""
+        """Make h an array that broadcasts over the rows, (d, 1, 1, *1)."""
         h = literal(np.array(self.h), self.sigma.dtype)
         return h.reshape(-1, *[1] * (self.sigma.ndim - 1))
 
     def gram(self, w: Scaling) -> list[jax.Array]:
-        """The entries 00, 10, 11, 20, 21, 22 of A'W^-2 A summed over copies, (n, *lanes) each."""
+        """Compute the entries 00, 10, 11, 20, 21, 22 of A'W^-2 A summed over copies, (n, *lanes) each."""
         pairs = [(a, b) for a in range(3) for b in range(a + 1)]
         rows = np.array(self.patterns)
         if w.size is None:
             weights = along(jnp.add, jnp.moveaxis(1 / (w.point * w.point), 1, 0))
             table = literal(np.stack([rows[:, a] * rows[:, b] for a, b in pairs], 1), weights.dtype)
-            entries = list(fold(jnp.add, spread_over(table, weights) * weights[:, None]))
+            entries = list(matvec_transposed(spread_over(table, weights), weights))
         else:
+            # W^-2 = (2 (J w)(J w)' - J) / size^2, so A'W^-2 A = (2 v v' - A'J A) / size^2 with v = A'J w.
             inverse = 1 / (w.size * w.size)
-            turned = cones.reflected(w.point)
-            v = fold(jnp.add, spread_over(self._matrix(), turned) * turned[:, None])
+            turned = cones.reflect(w.point)
+            v = matvec_transposed(spread_over(self._matrix(), turned), turned)
             signs = np.array([1.0] + [-1.0] * (rows.shape[0] - 1))
             bent = (rows * signs[:, None]).T @ rows
             total = along(jnp.add, inverse)
@@ -86,46 +88,46 @@ class ConeRows:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class ConicMargin:
-    """The program; lanes trail."""
+    """The program max lambda of this module's docstring; lanes trail."""
 
     rows: tuple[ConeRows, ...]
     columns: jax.Array
-    """(eq, 3, n, *lanes), E; zero where dropped or absent."""
+    """E, (eq, 3, n, *lanes); zero where a row is dropped or a block absent."""
     border: jax.Array
-    """(eq, *lanes), w."""
+    """The column w of lambda in the equality rows, (eq, *lanes)."""
     rhs: jax.Array
-    """(eq, *lanes), b."""
+    """The right-hand sides b, (eq, *lanes)."""
     dropped: jax.Array
-    """(eq, *lanes), 1 for equality rows that are zero."""
+    """A mask of the equality rows, (eq, *lanes): 1 for rows that are zero, else 0."""
 
     def equality(self, x: jax.Array, lam: jax.Array) -> jax.Array:
-        """E x + w lambda."""
-        return over_blocks(self.columns * x) + self.border * lam
+        """Compute E x + w lambda, (eq, *lanes)."""
+        return sum_over_blocks(self.columns * x) + self.border * lam
 
     def pull_back(self, y: jax.Array) -> jax.Array:
-        """E'y."""
+        """Compute E'y, (3, n, *lanes)."""
         return fold(jnp.add, self.columns * y[:, None, None])
 
     def apply(self, x: jax.Array, lam: jax.Array) -> Parts:
-        """A x + sigma lambda."""
+        """Compute A x + sigma lambda, (d, J, n, *lanes) a part."""
         return tuple(part.apply(x) + part.sigma * lam for part in self.rows)
 
     def adjoint(self, z: Parts) -> tuple[jax.Array, jax.Array]:
-        """A'z and sigma'z."""
+        """Compute A'z, (3, n, *lanes), and sigma'z, (*lanes)."""
         pulled = fold(jnp.add, [part.adjoint(z_p) for part, z_p in zip(self.rows, z, strict=True)])
         return pulled, inner([part.sigma for part in self.rows], z)
 
     def lagrangian(self, point: "ConicPoint") -> jax.Array:
-        """What the rows and equalities lack, weighed by the multipliers, (*lanes).
+        """Compute z'(A x + sigma lambda - h) + y'(E x + w lambda - b), (*lanes).
 
         Its derivative with respect to the data, negated, is that of the optimum (envelope theorem).
         """
-        lacking = [lhs - part.sides() for lhs, part in zip(self.apply(point.x, point.margin), self.rows, strict=True)]
-        return inner(lacking, point.z) + fold(jnp.add, point.y * (self.equality(point.x, point.margin) - self.rhs))
+        rows = [lhs - part.sides() for lhs, part in zip(self.apply(point.x, point.margin), self.rows, strict=True)]
+        return inner(rows, point.z) + fold(jnp.add, point.y * (self.equality(point.x, point.margin) - self.rhs))
 
 
 class ConicPoint(NamedTuple):
-    """x (3, n, *lanes), lambda (*lanes), and multipliers y (eq, *lanes) and z, parts (d, J, n, *lanes)."""
+    """A point x (3, n, *lanes), lambda (*lanes), and multipliers y (eq, *lanes) and z, parts (d, J, n, *lanes)."""
 
     x: jax.Array
     margin: jax.Array
@@ -133,28 +135,23 @@ class ConicPoint(NamedTuple):
     z: Parts
 
 
-def over_blocks(x: jax.Array) -> jax.Array:
-    """Sum over components and blocks, (eq, 3, n, *lanes) -> (eq, *lanes)."""
-    return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(x, 1, 0)), 1, 0))
-
-
 def inner(a: Parts | list[jax.Array], b: Parts | list[jax.Array]) -> jax.Array:
-    """Inner product of parts, (*lanes)."""
+    """Compute the inner product of parts, (*lanes)."""
     return fold(jnp.add, [reduce(jnp.add, u * v) for u, v in zip(a, b, strict=True)])
 
 
-def most(parts: Parts | list[jax.Array]) -> jax.Array:
-    """Largest entry of parts, (*lanes)."""
+def largest_entry(parts: Parts | list[jax.Array]) -> jax.Array:
+    """Compute the largest entry of parts, (*lanes)."""
     return fold(jnp.maximum, [reduce(jnp.maximum, v) for v in parts])
 
 
 def reduce(op: Any, v: jax.Array) -> jax.Array:
-    """Over rows, copies and blocks, (d, J, n, *lanes) -> (*lanes)."""
+    """Reduce over rows, copies and blocks, (d, J, n, *lanes) -> (*lanes)."""
     for _ in range(3):
         v = along(op, v)
     return v
 
 
 def along(op: Any, v: jax.Array) -> jax.Array:
-    """Reduce the leading axis; spelt out while it is short, see `fold`."""
-    return fold(op, v) if v.shape[0] <= _SPELT_OUT else op.reduce(v, axis=0)
+    """Reduce the leading axis, by `fold` while it is short."""
+    return fold(op, v) if v.shape[0] <= _LONGEST_FOLDED else op.reduce(v, axis=0)

@@ -11,10 +11,10 @@ from jax.typing import ArrayLike
 
 from jaxgrasp.arrays import as_float, broadcast_batch
 from jaxgrasp.compiling import compiled
-from jaxgrasp.lanes.independent import automatically, one_lane
+from jaxgrasp.lanes.independent import one_lane, with_automatic_axes
 from jaxgrasp.records import record
 from jaxgrasp.solvers import interior_point
-from jaxgrasp.solvers.dense.embedding import CONSTANTS, Embedding, Program, largest
+from jaxgrasp.solvers.dense.embedding import CONSTANTS, HomogeneousEmbedding, QuadraticProgram, largest
 from jaxgrasp.solvers.dense.sensitivity import solution_of, value_at
 from jaxgrasp.solvers.interior_point import Iterate, Settings
 from jaxgrasp.solvers.status import Status
@@ -23,15 +23,15 @@ _EQUILIBRATIONS = 10
 _MAX_ITERATIONS = 60
 # Steps without progress at the start, while tau finds its size, are common.
 _PATIENCE = 8
-# A side is far away that is larger than this, in units of the others.
+# A side larger than this, in units of the others, counts as far away.
 _FAR = 1e3
-# Sides at least this large are no sides, as in other solvers and in their files.
+# Sides at least this large count as infinite, as in other solvers and in their files.
 _INFINITE = 1e20
 
 
 @record
 class QPSolution:
-    """What `solve_qp` found; every field has the leading axes of the batch.
+    """The result of `solve_qp`; every field has the leading axes of the batch.
 
     Where a field has no meaning for the status it is NaN, or infinite for `objective` and the residuals.
     """
@@ -60,18 +60,19 @@ class QPSolution:
 
 
 def _typical(v: jax.Array) -> jax.Array:
-    """Geometric mean of the entries that are not zero, which a few huge ones do not drag along; 1 if none."""
+    """Compute the geometric mean of the nonzero entries, which a few huge ones hardly move; 1 if there are none."""
     nonzero = v != 0
     logs = jnp.where(nonzero, jnp.log(jnp.abs(jnp.where(nonzero, v, 1))), 0)
     return jnp.exp(jnp.sum(logs) / jnp.maximum(jnp.sum(nonzero, dtype=v.dtype), 1))
 
 
-def _equilibrated(program: Program) -> tuple[Program, Iterate]:
-    """Ruiz's scaling: rows and columns of the KKT matrix of largest entry 1, q, b and h of order 1.
+def _equilibrate(program: QuadraticProgram) -> tuple[QuadraticProgram, Iterate]:
+    """Scale a program by Ruiz's method: rows and columns of the KKT matrix of largest entry 1, q, b and h of order 1.
 
-    Returns the scaled program and the factors that take its x, y, s and z back.
+    Returns:
+        The scaled program, and the factors that turn its x, y, s and z into those of the program.
     """
-    # What the data are scaled by changes the path to the solution, not the solution: derivatives take it as constant.
+    # The scale changes the path to the solution, not the solution: derivatives take it as constant.
     P, q, A, b, G, h = lax.stop_gradient(program)
     (p, n), m = A.shape, h.size
     rows = jnp.concatenate([A, G])
@@ -83,14 +84,15 @@ def _equilibrated(program: Program) -> tuple[Program, Iterate]:
 
     scale = lax.fori_loop(0, _EQUILIBRATIONS, equilibrate, jnp.ones_like(matrix, shape=n + p + m))
     d, e, f = scale[:n], scale[n : n + p], scale[n + p :]
-    # A side that is far away, like 1e12 for none, says nothing about the size of x, and residuals are measured by the
+
+    # A side that is far away, like 1e12 for none, tells nothing about the size of x, but residuals are relative to the
     # sides: its row is divided until it is no longer far.
     sides = jnp.concatenate([b * e, h * f])
     usual = _typical(jnp.where(jnp.abs(sides) <= _FAR * _typical(sides), sides, 0))
     f = f / jnp.maximum(1, h * f / (_FAR * usual))
     cost, size = 1 / _typical(q * d), 1 / usual
     P, q, A, b, G, h = program
-    scaled = Program(
+    scaled = QuadraticProgram(
         P * d * d[:, None] * (cost / size),
         q * d * cost,
         A * d * e[:, None],
@@ -101,65 +103,78 @@ def _equilibrated(program: Program) -> tuple[Program, Iterate]:
     return scaled, Iterate(d / size, e / cost, 1 / (f * size), f / cost)
 
 
-def _solve_one(program: Program) -> QPSolution:
+def _solve_one(program: QuadraticProgram) -> QPSolution:
+    """Solve the program of one lane."""
+    # Check the data: infinite sides, numbers that are not finite, P that is not positive semidefinite.
     constants = CONSTANTS[program.q.dtype.name]
     absent, impossible = program.h >= _INFINITE, jnp.any(program.h <= -_INFINITE)
-    program = _without(program, jnp.abs(program.h) >= _INFINITE)
+    program = _replace_rows(program, jnp.abs(program.h) >= _INFINITE)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in program]))
     P = (program.P + program.P.T) / 2
     # Rounding in the caller's P may leave it that far from positive semidefinite.
     slack = 16 * P.shape[0] * jnp.finfo(P.dtype).eps * jnp.where(jnp.any(P != 0), largest(P), 1)
     shifted = jnp.where(finite, P / slack, 0) + jnp.eye(P.shape[0], dtype=P.dtype)
     valid = finite & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
-    program = Program(*(jnp.where(valid, v, 0) for v in program._replace(P=P)))
-    scaled, back = _equilibrated(program)
+    program = QuadraticProgram(*(jnp.where(valid, v, 0) for v in program._replace(P=P)))
+
+    # Run the loop on the equilibrated program, as constants to the derivative.
+    scaled, back = _equilibrate(program)
     settings = Settings(
         constants.tolerance, _MAX_ITERATIONS, constants.step_cap, constants.mu_floor, True, 0.0, _PATIENCE
     )
-    loop = lambda valid, scaled: interior_point.solve(Embedding(scaled, constants), settings, valid)
+    loop = lambda valid, scaled: interior_point.solve(HomogeneousEmbedding(scaled, constants), settings, valid)
     outcome = one_lane(loop, valid & ~impossible, lax.stop_gradient(scaled))
     record, iterate = outcome.record, outcome.record.iterate
-    found = jnp.where(record.error <= constants.accept, record.shows, int(Status.MAX_ITERATIONS))
-    status = jnp.where(valid, jnp.where(impossible, int(Status.INFEASIBLE), found), int(Status.INVALID_INPUT))
+    proven = jnp.where(record.error <= constants.accept, record.status, int(Status.MAX_ITERATIONS))
+    status = jnp.where(valid, jnp.where(impossible, int(Status.INFEASIBLE), proven), int(Status.INVALID_INPUT))
+
+    # Back to the caller's units: without derivatives for the certificates, with them for the solution.
     tau, iterate = iterate.z[-1], iterate._replace(s=iterate.s[:-1], z=jnp.where(absent, 0, iterate.z[:-1]))
-    at = lambda iterate: Iterate(*map(jnp.multiply, iterate, back))
-    answer = _answer(lax.stop_gradient(program), at(iterate), tau, status, outcome.iterations)
+    unscale = lambda iterate: Iterate(*map(jnp.multiply, iterate, back))
+    solution = _make_solution(lax.stop_gradient(program), unscale(iterate), tau, status, outcome.iterations)
     solved = status == Status.SOLVED
-    point = at(solution_of(scaled, Iterate(*(v / tau for v in iterate)), solved))
-    fields = {name: jnp.where(solved, v, getattr(answer, name)) for name, v in point._asdict().items()}
-    objective = value_at(program, point, answer.objective, solved)
-    told = replace(answer, objective=objective, **fields)
-    hide = lambda v: jnp.where(impossible, jnp.nan, v)
+    point = unscale(solution_of(scaled, Iterate(*(v / tau for v in iterate)), solved))
+    fields = {name: jnp.where(solved, v, getattr(solution, name)) for name, v in point._asdict().items()}
+    objective = value_at(program, point, solution.objective, solved)
+    solution = replace(solution, objective=objective, **fields)
+
+    # Rows with infinite sides: +inf has an infinite slack and no multiplier, -inf leaves no certificate.
+    nan_where_impossible = lambda v: jnp.where(impossible, jnp.nan, v)
     return replace(
-        told,
-        s=jnp.where(absent & ~jnp.isnan(told.s), jnp.inf, told.s),
-        y=hide(told.y),
-        z=hide(jnp.where(absent & ~jnp.isnan(told.z), 0, told.z)),
-        dual_residual=jnp.where(impossible, jnp.inf, told.dual_residual),
+        solution,
+        s=jnp.where(absent & ~jnp.isnan(solution.s), jnp.inf, solution.s),
+        y=nan_where_impossible(solution.y),
+        z=nan_where_impossible(jnp.where(absent & ~jnp.isnan(solution.z), 0, solution.z)),
+        dual_residual=jnp.where(impossible, jnp.inf, solution.dual_residual),
     )
 
 
-def _without(program: Program, absent: jax.Array) -> Program:
-    """The program with rows 0 x <= 1 in the place of some, the 1 as large as the other sides are."""
+def _replace_rows(program: QuadraticProgram, absent: jax.Array) -> QuadraticProgram:
+    """Put rows 0 x <= 1 in the place of absent ones; the 1 is as large as the other sides are."""
     G, h = jnp.where(absent[:, None], 0, program.G), jnp.where(absent, 0, program.h)
     size = _typical(lax.stop_gradient(jnp.concatenate([program.b, h])))
     return program._replace(G=G, h=jnp.where(absent, size, h))
 
 
-def _answer(program: Program, iterate: Iterate, tau: jax.Array, status: jax.Array, iterations: jax.Array) -> QPSolution:
-    """The iterate divided by tau, or the certificate that it is, with residuals in the caller's units."""
+def _make_solution(
+    program: QuadraticProgram, iterate: Iterate, tau: jax.Array, status: jax.Array, iterations: jax.Array
+) -> QPSolution:
+    """Divide the iterate by tau, or scale it to a certificate, and compute residuals in the caller's units."""
     P, q, A, b, G, h = program
-    none, ray, valid = status == Status.INFEASIBLE, status == Status.UNBOUNDED, status != Status.INVALID_INPUT
-    shown = ~none & ~ray & valid
-    # A certificate is measured by b'y + h'z or q'x; neither touches the numbers of the other.
+    infeasible, ray, valid = status == Status.INFEASIBLE, status == Status.UNBOUNDED, status != Status.INVALID_INPUT
+    has_point = ~infeasible & ~ray & valid
+
+    # Scale a certificate to b'y + h'z = -1 and a ray to q'x = -1; neither changes the numbers of the other.
     x, s = (v / jnp.where(ray, -q @ iterate.x, tau) for v in (iterate.x, iterate.s))
-    y, z = (v / jnp.where(none, -b @ iterate.y - h @ iterate.z, tau) for v in (iterate.y, iterate.z))
+    y, z = (v / jnp.where(infeasible, -b @ iterate.y - h @ iterate.z, tau) for v in (iterate.y, iterate.z))
+
+    # Residuals, whose right-hand sides are zero for rays (b, h) and certificates (q).
     Px, pull = P @ x, A.T @ y + G.T @ z
     primal = jnp.maximum(largest(A @ x - jnp.where(ray, 0, b)), largest(G @ x + s - jnp.where(ray, 0, h)))
-    dual = largest(jnp.where(none, 0, Px + q) + pull)
+    dual = largest(jnp.where(infeasible, 0, Px + q) + pull)
     infinite = jnp.asarray(jnp.inf, q.dtype)
-    value = jnp.where(none, infinite, jnp.where(ray, -infinite, x @ Px / 2 + q @ x))
-    with_x, with_y = valid & ~none, valid & ~ray
+    value = jnp.where(infeasible, infinite, jnp.where(ray, -infinite, x @ Px / 2 + q @ x))
+    with_x, with_y = valid & ~infeasible, valid & ~ray
     return QPSolution(
         x=jnp.where(with_x, x, jnp.nan),
         s=jnp.where(with_x, s, jnp.nan),
@@ -169,7 +184,7 @@ def _answer(program: Program, iterate: Iterate, tau: jax.Array, status: jax.Arra
         status=status,
         primal_residual=jnp.where(with_x, jnp.where(ray, jnp.maximum(primal, largest(Px)), primal), infinite),
         dual_residual=jnp.where(with_y, dual, infinite),
-        gap=jnp.where(shown, jnp.abs(x @ Px + q @ x + b @ y + h @ z), infinite),
+        gap=jnp.where(has_point, jnp.abs(x @ Px + q @ x + b @ y + h @ z), infinite),
         iterations=iterations,
     )
 
@@ -191,10 +206,10 @@ def solve_qp(
     -inf cannot be met. So l <= G x <= u with any sides infinite is G = [G; -G] and h = [u; -l].
 
     Differentiable in all data, forward and reverse and repeatedly, at the cost of about one more step: x, s, y, z and
-    objective by the implicit function theorem, see `qp_sensitivity`. Those of objective hold wherever there is a
-    solution. Those of the others need it to be unique and strictly complementary: where it is not, they are finite, and
-    those of x, s, y or z not unique mean nothing. Lanes that are not SOLVED, residuals, gap and status have derivatives
-    that are exactly zero.
+    objective by the implicit function theorem, see `sensitivity`. The derivatives of objective hold wherever there is a
+    solution. Those of x, s, y and z hold where it is unique and strictly complementary; elsewhere they are finite, but
+    mean nothing for an x, s, y or z that is not unique. Lanes that are not SOLVED, residuals, gap and status have
+    derivatives that are exactly zero.
 
     Args:
         P: (*batch, n, n), positive semidefinite; only its symmetric part counts. None: a linear program.
@@ -222,37 +237,39 @@ def solve_qp(
     dtype = jnp.result_type(P, q, *rows)
     if dtype.name not in CONSTANTS:
         raise ValueError(f"P, q, A, b, G, h: got dtype {dtype.name} together, wanted float32 or float64")
-    program = Program(P, q, *rows)
+    program = QuadraticProgram(P, q, *rows)
     events = (2, 1, 2, 1, 2, 1)
-    shapes = {name: v.shape[: v.ndim - k] for name, v, k in zip(Program._fields, program, events, strict=True)}
+    shapes = {name: v.shape[: v.ndim - k] for name, v, k in zip(QuadraticProgram._fields, program, events, strict=True)}
     batch = broadcast_batch(**shapes)
-    # What all share stays one: XLA would fold what it computes of a batch of zeros while it compiles, for seconds.
+    # Data that all lanes share stay without a batch: XLA would fold computations on a batch of zeros while it compiles,
+    # for seconds.
     shared = [bool(batch) and v.ndim == k for v, k in zip(program, events, strict=True)]
     lanes = [
         v.astype(dtype)
-        if alone
+        if is_shared
         else jnp.broadcast_to(v, (*batch, *v.shape[v.ndim - k :]))
         .reshape(math.prod(batch), *v.shape[v.ndim - k :])
         .astype(dtype)
-        for v, k, alone in zip(program, events, shared, strict=True)
+        for v, k, is_shared in zip(program, events, shared, strict=True)
     ]
-    return _solve_lanes(tuple(shared), batch, Program(*lanes))
+    return _solve_lanes(tuple(shared), batch, QuadraticProgram(*lanes))
 
 
 @partial(compiled, static_argnums=(0, 1))
-def _solve_lanes(shared: tuple[bool, ...], batch: tuple[int, ...], lanes: Program) -> QPSolution:
-    solve = jax.vmap(lambda *data: _solve_one(Program(*data)), in_axes=tuple(None if alone else 0 for alone in shared))
-    solution = automatically(solve, lanes, shared)
+def _solve_lanes(shared: tuple[bool, ...], batch: tuple[int, ...], lanes: QuadraticProgram) -> QPSolution:
+    """Solve all lanes; `shared` tells for every field of the program whether all lanes share it."""
+    solve = jax.vmap(lambda *data: _solve_one(QuadraticProgram(*data)), in_axes=tuple(None if s else 0 for s in shared))
+    solution = with_automatic_axes(solve, lanes, shared)
     return jax.tree.map(lambda v: v.reshape(*batch, *v.shape[1:]), solution)
 
 
 def _pair(
     rows_name: str, rows: ArrayLike | None, side_name: str, side: ArrayLike | None, n: int, dtype: jnp.dtype
 ) -> tuple[jax.Array, jax.Array]:
-    """A matrix of rows and its right-hand side, both or none."""
+    """Check a matrix of rows and its right-hand side; both may be None, for no rows."""
     if (rows is None) != (side is None):
-        missing, given = (rows_name, side_name) if rows is None else (side_name, rows_name)
-        raise ValueError(f"{missing}: got None with {given} given, wanted both or none")
+        missing, present = (rows_name, side_name) if rows is None else (side_name, rows_name)
+        raise ValueError(f"{missing}: got None with {present} given, wanted both or none")
     if rows is None or side is None:
         return jnp.zeros((0, n), dtype), jnp.zeros((0,), dtype)
     matrix = as_float(rows_name, rows, ("rows", n))
