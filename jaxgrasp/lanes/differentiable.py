@@ -1,7 +1,10 @@
 """Kernels over the lanes of a batch, with derivatives that are kernels, too.
 
-The values come from stages that JAX does not look into (the solver's loop runs in them). Derivatives come from
-functions of the same data that are as cheap as they can be, see `derivatives`; here they are applied to lanes.
+JAX does not look into the stages that compute the values: the solver's loop runs in them. A kernel states its
+derivative itself, as a function of the same arguments; this module runs that function over the lanes.
+
+The arguments of a kernel are a pytree of the caller's. Which leaves all lanes share, and which leaves change, is told
+by parallel pytrees: with the same structure, and a bool or a change in place of each array.
 """
 
 from abc import ABC, abstractmethod
@@ -19,27 +22,23 @@ from jaxgrasp.lanes.linear import linear_lanes, transposed_lanes
 from jaxgrasp.lanes.tiles import map_lanes
 
 Tree = Any
-Raw = dict[str, jax.Array]
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """How the arguments of a kernel lie: leaves (lanes, ...), or without the leading axis where shared.
+    """How the arguments of a kernel lie: leaves (lanes, ...), or without the leading axis where shared."""
 
-    admit: makes of them, lanes last, what the kernels take.
-    shared: by name of the argument.
-    rows: how many rows a lane has, which sets the size of a tile.
-    compact: whether a tile can be one function, see `map_lanes`.
-    tile: lanes of a tile that cannot.
-    known_as: tells `admit` from all others that take arguments of the same names and shapes.
-    """
-
-    admit: Callable[[Raw], Any]
-    shared: dict[str, bool]
+    admit: Callable[[Tree], Any]
+    """Turns the arguments, lanes last, into what the kernels take: a function of a module, so that its name tells which
+    one it is."""
+    shared: Tree
+    """Whether all lanes share a leaf, a bool for each, parallel to the arguments."""
     rows: int
+    """The number of rows of a lane, which sets the size of a tile."""
     compact: bool
+    """Whether a tile can be one function, see `map_lanes`."""
     tile: int
-    known_as: str
+    """The number of lanes of a tile that cannot be one function."""
 
 
 class Kernel(Protocol):
@@ -102,77 +101,88 @@ class Plain(ABC):
 
 @dataclass(frozen=True)
 class Along:
-    """A change of the arguments of all lanes; `moved` has those that change at all."""
+    """A change of the arguments of all lanes."""
 
     lanes: Lanes
-    arguments: Raw
-    moved: Raw
+    """How the arguments lie."""
+    arguments: Tree
+    """The arguments: leaves (lanes, ...), or without the leading axis where shared."""
+    changes: Tree
+    """The changes, parallel to the arguments: leaves (lanes, ...), None where a leaf does not change at all."""
 
     def function(self, function: Callable[[Any], Tree], like: Tree) -> Tree:
         """The derivative of `function(admitted arguments)`, lanes last, as JAX finds it."""
 
-        def kernel(arguments: Raw, moved: Raw) -> Tree:
-            at, start = self._admitted(arguments, moved)
-            return jax.jvp(lambda some: function(at(some)), (start,), (moved,))[1]
+        def kernel(arguments: Tree, changes: Tree) -> Tree:
+            at, start = self._admitted(arguments, changes)
+            return jax.jvp(lambda varied: function(at(varied)), (start,), (changes,))[1]
 
-        return linear_lanes(kernel, self.arguments, self.moved, self.lanes.shared, like)
+        return linear_lanes(kernel, self.arguments, self.changes, self.lanes.shared, like)
 
-    def adjoint(self, adjoint: Callable[[Any, Tree, Tree, frozenset], Any], held: Tree, like: Tree) -> Tree:
+    def adjoint(self, adjoint: Callable[[Any, Tree, Tree], Any], held: Tree, like: Tree, compact: bool = False) -> Tree:
         """The derivative whose transpose is given.
 
         Args:
-            adjoint: called with the admitted arguments, `held`, cotangents (like `like`, None where zero) and the names
-                of the arguments that change; returns the cotangents of the admitted arguments.
-            held: what it is given beside the arguments, leaves (lanes, ...).
+            adjoint: called with the admitted arguments, `held` and cotangents (like `like`, None where zero); returns
+                the cotangents of the admitted arguments.
+            held: what the adjoint is given beside the arguments, leaves (lanes, ...).
             like: arrays like the result.
+            compact: whether the adjoint, too, is free of library calls and large reductions, see `map_lanes`.
         """
-        names = frozenset(self.moved)
 
-        def back(data: tuple[Raw, Tree], cotangents: Tree) -> Raw:
+        def back(data: tuple[Tree, Tree], cotangents: Tree) -> Tree:
             arguments, held = data
             lanes = jax.tree.leaves(cotangents)[0].shape[-1]
-            like = {name: jnp.broadcast_to(arguments[name], (*arguments[name].shape[:-1], lanes)) for name in names}
-            at, start = self._admitted(arguments, like)
+            spread = lambda _, x: jnp.broadcast_to(x, (*x.shape[:-1], lanes))
+            at, start = self._admitted(arguments, _where_changed(spread, self.changes, arguments))
             admitted, pull = jax.vjp(at, start)
-            return pull(adjoint(admitted, held, cotangents, names))[0]
+            return pull(adjoint(admitted, held, cotangents))[0]
 
-        # With respect to the set itself there are reductions, and roots of matrices are library calls; what comes with
-        # actuators is JAX's own transpose.
-        compact = self.lanes.compact and "jacobian" not in self.arguments
-        compact &= not any(name.startswith("term") for name in names)
         shared = (self.lanes.shared, jax.tree.map(lambda _: False, held))
-        rows = self.lanes.rows if compact else 0
-        return transposed_lanes(back, (self.arguments, held), self.moved, shared, like, rows)
+        rows = self.lanes.rows if self.lanes.compact and compact else 0
+        return transposed_lanes(back, (self.arguments, held), self.changes, shared, like, rows)
 
     def value(self, kernel: Kernel, held: Tree) -> Tree:
         """Another kernel over the same arguments."""
         return differentiable(kernel, self.lanes, self.arguments, held)
 
-    def _admitted(self, arguments: Raw, moved: Raw) -> tuple[Callable[[Raw], Any], Raw]:
+    def _admitted(self, arguments: Tree, changes: Tree) -> tuple[Callable[[Tree], Any], Tree]:
         """The admitted arguments as a function of those that change, and these."""
-        start = {name: jnp.broadcast_to(arguments[name], moved[name].shape) for name in moved}
-        return lambda some: self.lanes.admit({**arguments, **some}), start
+        start = _where_changed(lambda change, x: jnp.broadcast_to(x, change.shape), changes, arguments)
+        instead = lambda new, x: x if new is None else new
+        return lambda varied: self.lanes.admit(jax.tree.map(instead, varied, arguments, is_leaf=_is_none)), start
 
 
-def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()) -> Tree:
+def _where_changed(function: Callable[[Any, Any], Any], changes: Tree, arguments: Tree) -> Tree:
+    """`function` of each change and its argument, None where there is no change."""
+    apply = lambda change, x: None if change is None else function(change, x)
+    return jax.tree.map(apply, changes, arguments, is_leaf=_is_none)
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
+
+
+def differentiable(kernel: Kernel, lanes: Lanes, arguments: Tree, held: Tree = ()) -> Tree:
     """Run a kernel over lanes; its derivatives with respect to the arguments, of any order, are its `tangents`.
 
     Args:
         kernel: what to run.
         lanes: how the arguments lie.
-        arguments: by name.
+        arguments: a pytree of arrays, leaves (lanes, ...), or without the leading axis where shared.
         held: what else the kernel is given, leaves (lanes, ...); constants to the derivative.
     """
 
     @jax.custom_jvp
-    def value(arguments: Raw, held: Tree) -> Tree:
-        def enter(given: tuple[Raw, Tree]) -> Tree:
-            return kernel.stages[0](lanes.admit(given[0]), given[1])
+    def value(arguments: Tree, held: Tree) -> Tree:
+        def enter(inputs: tuple[Tree, Tree]) -> Tree:
+            return kernel.stages[0](lanes.admit(inputs[0]), inputs[1])
 
         shared = (lanes.shared, jax.tree.map(lambda _: False, held))
         stages = (enter, *kernel.stages[1:])
-        # Kernels have no state but their fields, which are numbers and names.
-        known_as = f"{type(kernel).__module__}.{type(kernel).__qualname__} {vars(kernel)} {lanes.known_as}"
+        # Kernels have no state but their fields, which are numbers, names and types.
+        name = lambda function: f"{function.__module__}.{function.__qualname__}"
+        known_as = f"{name(type(kernel))} {vars(kernel)} {name(lanes.admit)}"
         return map_lanes(
             stages,
             (arguments, held),
@@ -189,14 +199,17 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()
         arguments, held = primals
         out = value(arguments, held)
         count = jax.tree.leaves(out)[0].shape[0]
-        moved = {}
-        for name, dot in dots[0].items():
-            if type(dot) is not SymbolicZero:
-                moved[name] = jnp.broadcast_to(dot, (count, *dot.shape)) if lanes.shared[name] else dot
-        if not moved:
+
+        def change_of(dot: Any, shared: bool) -> jax.Array | None:
+            if type(dot) is SymbolicZero:
+                return None
+            return jnp.broadcast_to(dot, (count, *dot.shape)) if shared else dot
+
+        changes = jax.tree.map(change_of, dots[0], lanes.shared)
+        if not jax.tree.leaves(changes):
             return out, jax.tree.map(partial(zero_from_primal, symbolic_zeros=True), out)
-        change = kernel.tangents(Along(lanes, arguments, moved), out)
+        tangents = kernel.tangents(Along(lanes, arguments, changes), out)
         still = lambda x, dot: zero_from_primal(x, symbolic_zeros=True) if dot is None else dot
-        return out, jax.tree.map(still, out, change, is_leaf=lambda x: x is None)
+        return out, jax.tree.map(still, out, tangents, is_leaf=_is_none)
 
     return value(arguments, held)

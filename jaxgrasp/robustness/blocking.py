@@ -14,6 +14,7 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.differentiable import Plain
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData
 
 
 def blocking_forces(
@@ -35,7 +36,8 @@ def blocking_forces(
     Raises:
         ValueError: shapes that do not fit.
     """
-    return over_grasps(_BlockingForces(), contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
+    data = GraspData.from_arguments(contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
+    return over_grasps(_BlockingForces(), data)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from jaxgrasp.lanes.differentiable import OfPyramids, Plain
 from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.robustness.actuators import effort_reach
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData
 
 
 def worst_case(
@@ -50,7 +51,8 @@ def worst_case(
         ValueError: shapes or options that do not fit.
     """
     pyramid_facets(cone_edges)
-    return over_grasps(_WorstCase(cone_edges), contacts, disturbances, compliance=compliance)
+    data = GraspData.from_arguments(contacts, disturbances, compliance=compliance)
+    return over_grasps(_WorstCase(cone_edges), data)
 
 
 class _WorstCase(OfPyramids, Plain):

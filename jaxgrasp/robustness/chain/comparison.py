@@ -16,6 +16,7 @@ from jaxgrasp.robustness.chain.formulations import Chain, check_vertices, formul
 from jaxgrasp.robustness.chain.programs import FORMULATIONS
 from jaxgrasp.robustness.chain.verdicts import FormulationSolution
 from jaxgrasp.robustness.grasps import over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.margin import largest_disturbance
 from jaxgrasp.solvers.status import Status
@@ -101,7 +102,7 @@ def compare_formulations(
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
     kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", tile_of(contacts, disturbances))
-    found = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)
+    found = over_grasps(kernel, GraspData.from_arguments(contacts, disturbances, required_wrench, compliance))
     own: dict[str, FormulationSolution] = {name: solution for name, (solution, _) in found.items()}
     reduced = largest_disturbance(contacts, disturbances, required_wrench, compliance, cone_edges)
     solutions: dict[str, FormulationSolution | Solution] = {**own, "21": reduced}

@@ -52,7 +52,7 @@ from jaxgrasp.robustness.chain.verdicts import (
     solved_program,
 )
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.interface.arguments import Arguments
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.conic.margin import ConicPoint
 from jaxgrasp.solvers.status import Status
@@ -120,7 +120,7 @@ def formulation_margin(
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
     kernel = Chain((formulation,), cone_edges, force_bound == "norm", tile_of(contacts, disturbances))
-    solved = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)
+    solved = over_grasps(kernel, GraspData.from_arguments(contacts, disturbances, required_wrench, compliance))
     return solved[formulation][0]
 
 
@@ -277,7 +277,7 @@ class Chain(Audited):
             answers[name] = solution, solved[twin].point
         return answers
 
-    def _adjoint(self, grasps: Grasps, held: dict, cotangents: dict, names: frozenset) -> Grasps:
+    def _adjoint(self, grasps: Grasps, held: dict, cotangents: dict) -> Grasps:
         """The gradient of the Lagrangians with respect to the data, times cotangents of margins and directions."""
         _, scaled = self._scaled(grasps)
         weights, points = {}, {}

@@ -8,7 +8,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxgrasp.arrays import fold
+from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
@@ -29,7 +29,7 @@ from jaxgrasp.robustness.chain.formulations import check_vertices, tile_of
 from jaxgrasp.robustness.chain.programs import FORMULATIONS, Basics, basics, scaled_formulation
 from jaxgrasp.robustness.chain.verdicts import Verdict, programs, solved_program, verdict
 from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.interface.arguments import Arguments
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, optional_float
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.arrow import ArrowProblem, patterns_of
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
@@ -109,15 +109,11 @@ def least_total_effort(
     check_vertices(disturbances)
     if compliance is not None and jnp.shape(compliance)[-3:] != (contacts.n_c, 3, 3):
         raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {contacts.n_c}, 3, 3)")
-    return over_grasps(
-        _TotalEffort(cone_edges, tile_of(contacts, disturbances)),
-        contacts,
-        disturbances,
-        required_wrench=required_wrench,
-        compliance=compliance,
-        effort_weights=effort_weights,
-        margin=margin,
-    )[0]
+    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    options = Options(
+        margin=as_float("margin", margin, ()), effort_weights=optional_float("effort_weights", effort_weights)
+    )
+    return over_grasps(_TotalEffort(cone_edges, tile_of(contacts, disturbances)), data, options)[0]
 
 
 @dataclass(frozen=True)
@@ -183,7 +179,7 @@ class _TotalEffort(OfPyramids, Audited):
         answer = verdict(grasps, shared, scale, _FREE, found)
         # Each direction on its way from f_0 to the most that it allows: inside the rows.
         some = answer.answered & jnp.isfinite(answer.directions) & (answer.directions > 0)
-        share = jnp.where(some, grasps.asked / jnp.where(some, answer.directions, 1), 0)
+        share = jnp.where(some, _asked(grasps) / jnp.where(some, answer.directions, 1), 0)
         x, rest = found.point.x, found.point.x[:, :, -1:]
         guess = jnp.concatenate([rest + jnp.clip(share, 0, 1) * (x[:, :, :-1] - rest), rest], 2)
         return grasps, shared, answer, guess
@@ -194,7 +190,7 @@ class _TotalEffort(OfPyramids, Audited):
         settings = _SETTINGS[dtype]
         bearable = answer.answered
         most = jnp.maximum(jnp.min(answer.upper, 0), jnp.min(answer.directions, 0))
-        active = bearable & (grasps.asked <= most * (1 + settings.tolerance))
+        active = bearable & (_asked(grasps) <= most * (1 + settings.tolerance))
         # Without a load and disturbances no forces at all are the answer. What rounding leaves of nothing counts as
         # nothing: a grasp that withstands none has no room inside its rows.
         idle = active & (jnp.abs(problem.rhs) <= _NOTHING[dtype]).all((0, 1))
@@ -219,7 +215,7 @@ class _TotalEffort(OfPyramids, Audited):
         )
         return solution, record
 
-    def _adjoint(self, grasps: Grasps, held: tuple, cotangents: tuple, names: frozenset) -> Grasps:
+    def _adjoint(self, grasps: Grasps, held: tuple, cotangents: tuple) -> Grasps:
         solution, record = held
         weight = jnp.where(jnp.isfinite(solution.effort), cotangents[0], 0)
         record = jax.tree.map(lambda x: jnp.where(weight != 0, x, 0), record)
@@ -231,9 +227,15 @@ class _TotalEffort(OfPyramids, Audited):
         return jax.grad(value, allow_int=True)(grasps)
 
 
+def _asked(grasps: Grasps) -> jax.Array:
+    """The margin that is asked for, (*lanes)."""
+    assert grasps.options.margin is not None
+    return grasps.options.margin
+
+
 def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) -> tuple[ArrowProblem, jax.Array]:
     """(11) in scaled forces, and the unit of effort."""
-    dtype, present = shared.sizes.dtype, grasps.present
+    dtype, present, weights = shared.sizes.dtype, grasps.present, grasps.options.effort_weights
     eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[..., None, None], (3, 3, *present.shape))
 
     def scaled(blocks: jax.Array | None) -> jax.Array:
@@ -241,7 +243,7 @@ def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) 
         blocks = eye if blocks is None else blocks
         return blocks * shared.sizes[:, None] * shared.sizes * present + eye * (1 - present)
 
-    own = scaled(None if grasps.weights is None else jnp.moveaxis(grasps.weights, 0, 2))
+    own = scaled(None if weights is None else jnp.moveaxis(weights, 0, 2))
     change = None
     if grasps.half is not None:
         inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.half, grasps.half)
@@ -249,7 +251,7 @@ def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) 
     change = scaled(change)
     largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (own, change)])
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
-    targets = jnp.concatenate([shared.load[:, None] - grasps.asked * shared.targets, shared.load[:, None]], 1)
+    targets = jnp.concatenate([shared.load[:, None] - _asked(grasps) * shared.targets, shared.load[:, None]], 1)
     patterns, h = patterns_of(pyramid_facets(cone_edges), dtype, 3)
     problem = ArrowProblem(
         patterns=patterns,

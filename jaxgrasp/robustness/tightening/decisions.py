@@ -11,8 +11,15 @@ from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.certificates import balanced, certified
-from jaxgrasp.robustness.tightening.derivatives import central_kappa, centred
-from jaxgrasp.robustness.tightening.program import Program, actuated_values, effort_of, effort_problem, margin_problem
+from jaxgrasp.robustness.tightening.objectives import (
+    LeastEffort,
+    Objective,
+    effort_of,
+    effort_problem,
+    margin_problem,
+)
+from jaxgrasp.robustness.tightening.points import centred
+from jaxgrasp.robustness.tightening.program import Program, actuated_values
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.interior_point import Iterate, Settings
@@ -69,7 +76,7 @@ def evidence(grasps: Grasps, program: Program, record: Record) -> Evidence:
 def solve_margin(grasps: Grasps, program: Program) -> tuple[Solution, Record, Iterate]:
     """(21) for lanes; also the scaled record, from which (22) starts, and the last iterate."""
     dtype = program.rhs.dtype
-    problem = margin_problem(program, grasps.cutoff)
+    problem = margin_problem(program, grasps.options.cutoff)
     settings = _towards_centre(_SETTINGS[dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     point = balanced(program, problem, outcome.record.x)
@@ -164,9 +171,9 @@ def _unloaded(grasps: Grasps, program: Program) -> jax.Array:
 
 def _towards_centre(settings: Settings, grasps: Grasps, program: Program, unit: jax.Array) -> Settings:
     """Where smoothing is asked for, the loop aims at the central point, whose gap is kappa for every row."""
-    if grasps.smoothing is None:
+    if grasps.options.smoothing is None:
         return settings
-    kappa = central_kappa(grasps, program, unit)
+    kappa = grasps.options.smoothing / unit
     rows = program.sigma.shape[0] * fold(jnp.add, grasps.present)
     if program.efforts is not None:
         rows = rows + program.efforts.h.shape[0] * program.efforts.h.shape[1]
@@ -174,9 +181,11 @@ def _towards_centre(settings: Settings, grasps: Grasps, program: Program, unit: 
     return settings._replace(gap_floor=1.5 * gap, mu_floor=kappa)
 
 
-def at_centre(grasps: Grasps, program: Program, iterate: Iterate, solution: Solution, possible: jax.Array) -> Solution:
+def at_centre(
+    objective: Objective, grasps: Grasps, program: Program, iterate: Iterate, solution: Solution, possible: jax.Array
+) -> Solution:
     """The solution with the central point in place of the best one; solved where that is found."""
-    point = centred(grasps, program, iterate, possible)
+    point = centred(objective, grasps, program, iterate, possible)
     margin = jnp.where(program.slippery, jnp.minimum(point.margin, 0), point.margin)
     values = point._replace(margin=margin)._asdict()
     found = values.pop("usable")
@@ -198,7 +207,8 @@ def solve_effort(grasps: Grasps, program: Program, first: Solution, record: Reco
     dtype, blocks = program.rhs.dtype, program.blocks
     problem, wanted, unit = effort_problem(grasps, program)
     settings = _towards_centre(_EFFORT_SETTINGS[dtype.name], grasps, program, unit**2)
-    reachable = grasps.asked <= first.upper_bound * (1 + settings.tolerance)
+    assert grasps.options.margin is not None
+    reachable = grasps.options.margin <= first.upper_bound * (1 + settings.tolerance)
     held = (reachable & jnp.isfinite(record.lower)) | program.undisturbed
 
     # Between (21)'s answer and its start, which is deep inside the rows, but for those that the margin asks for.
@@ -243,7 +253,7 @@ def solve_effort(grasps: Grasps, program: Program, first: Solution, record: Reco
         margin=hide(jnp.where(attained > first.upper_bound, first.upper_bound, attained)),
         upper_bound=first.upper_bound,
         forces=hide(forces),
-        effort=hide(effort_of(forces, grasps.weights)),
+        effort=hide(effort_of(forces, grasps.options.effort_weights)),
         status=status,
         iterations=first.iterations + outcome.iterations,
         primal_residual=hide(missed),
@@ -255,6 +265,6 @@ def solve_effort(grasps: Grasps, program: Program, first: Solution, record: Reco
         wrench_multipliers=program.wrench_multipliers(best.y, grasps.units) * unit**2,
         **{name: hide(value) for name, value in actuated_values(program, best.x, best, grasps.units, unit**2).items()},
     )
-    if grasps.smoothing is None:
+    if grasps.options.smoothing is None:
         return solution
-    return at_centre(grasps, program, outcome.iterate, solution, active & ~idle)
+    return at_centre(LeastEffort(), grasps, program, outcome.iterate, solution, active & ~idle)

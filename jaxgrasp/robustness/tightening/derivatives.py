@@ -9,7 +9,7 @@ and the margin itself where smoothing is asked for, by the implicit function the
 `sensitivity`.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -21,42 +21,13 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.lanes.differentiable import Along, OfPyramids
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.program import (
-    Program,
-    actuated_values,
-    effort_of,
-    effort_problem,
-    margin_problem,
-    prepared,
-    scaled_program,
-    weighed,
-)
+from jaxgrasp.robustness.tightening.objectives import LargestMargin, LeastEffort, Objective, weighed
+from jaxgrasp.robustness.tightening.points import Point, central_kappa, centred, iterate_of, point_of
+from jaxgrasp.robustness.tightening.program import Program, prepared, scaled_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
-from jaxgrasp.solvers.block.kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows, total
-from jaxgrasp.solvers.block.sensitivity import central_point, solve_symmetric
+from jaxgrasp.solvers.block.kkt import total
+from jaxgrasp.solvers.block.sensitivity import solve_symmetric
 from jaxgrasp.solvers.interior_point import Iterate, reduce_rows
-
-# kappa of the central points whose derivatives stand for those of the exact forces of (21) and of (22), in the solver's
-# units, and the largest residual with which they count as found. Of (21) many forces may be optimal, and what tells
-# them apart has a share of kappa^2: below 1e-6 rounding is felt.
-_KAPPA = {"float64": (1e-6, 1e-8), "float32": (1e-4, 1e-5)}
-_FOUND = {"float64": 1e-9, "float32": 1e-4}
-
-
-class Point(NamedTuple):
-    """A point of (21) or (22) with multipliers, in newtons and metres as in `Solution`; lanes trail or lead."""
-
-    margin: jax.Array
-    forces: jax.Array
-    effort: jax.Array
-    cone_multipliers: jax.Array
-    bound_multipliers: jax.Array
-    wrench_multipliers: jax.Array
-    usable: jax.Array
-    """bool (*lanes): where it is one."""
-    actuator_efforts: jax.Array | None = None
-    actuator_multipliers: jax.Array | None = None
-    joint_multipliers: jax.Array | None = None
 
 
 class RowWeights(NamedTuple):
@@ -82,7 +53,7 @@ class RowWeights(NamedTuple):
     margin: jax.Array | None = None
 
 
-def envelope_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: tuple, names: frozenset) -> Grasps:
+def envelope_adjoint(cone_edges: int, with_terms: bool, grasps: Grasps, point: Point, cotangents: tuple) -> Grasps:
     """The gradient of (21)'s Lagrangian with respect to the data, times a cotangent (*lanes)."""
     weight = jnp.where(point.usable, cotangents[0], 0)
     if grasps.actuated is not None:
@@ -102,23 +73,21 @@ def envelope_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
         columns=-(y / grasps.units)[:, None, None] * force,
         wrench=y / grasps.units,
     )
-    return _to_grasps(grasps, rows, cone_edges, names)
+    return _to_grasps(grasps, rows, cone_edges, with_terms)
 
 
-def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, names: frozenset) -> Grasps:
+def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, with_terms: bool) -> Grasps:
     """Cotangents of the data, from those of the rows."""
     zero = jax.tree.map(_nothing, grasps)
-    columns, friction, half, terms = reach_adjoint(
-        grasps, rows.cone_reach, rows.bound_reach, cone_edges, any(name.startswith("term") for name in names)
-    )
+    columns, friction, half, terms = reach_adjoint(grasps, rows.cone_reach, rows.bound_reach, cone_edges, with_terms)
     if grasps.vertex_halves is not None:
         zero = replace(zero, vertex_halves=half)
     elif grasps.half is not None:
         zero = replace(zero, half=half)
     if rows.weights is not None:
-        zero = replace(zero, weights=rows.weights)
+        zero = replace(zero, options=replace(zero.options, effort_weights=rows.weights))
     if rows.margin is not None:
-        zero = replace(zero, margin=rows.margin)
+        zero = replace(zero, options=replace(zero.options, margin=rows.margin))
     return replace(
         zero,
         friction=rows.friction + friction,
@@ -134,8 +103,12 @@ def _nothing(x: jax.Array) -> jax.Array | np.ndarray:
     return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
 
 
+@dataclass(frozen=True)
 class CentralPoint(OfPyramids):
-    """The kernel that finds the central point next to a point of (21) or, where a margin is asked for, of (22)."""
+    """The kernel that finds the central point next to a point of (21) or (22)."""
+
+    objective: Objective
+    """Which of the two programs it is."""
 
     @property
     def stages(self) -> tuple:
@@ -143,22 +116,38 @@ class CentralPoint(OfPyramids):
         return (lambda grasps, point: (*prepared(grasps, self.cone_edges), point), lambda given: self._find(*given))
 
     def _find(self, grasps: Grasps, program: Program, point: Point) -> Point:
-        problem, unit = _problem(grasps, program)
-        return centred(grasps, program, _iterate(problem, program, point, unit, None), point.usable)
+        problem, unit = self.objective.problem(grasps, program)
+        return centred(self.objective, grasps, program, iterate_of(problem, program, point, unit, None), point.usable)
 
     def tangents(self, along: Along, out: Point) -> Point:
         """See `Kernel`."""
-        return along.adjoint(partial(_central_adjoint, self.cone_edges), out, out._replace(usable=None))
+        adjoint = partial(_central_adjoint, self.objective, self.cone_edges, set_changes(along))
+        return along.adjoint(adjoint, out, out._replace(usable=None), is_compact(along))
 
 
-def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: Point, names: frozenset) -> Grasps:
+def set_changes(along: Along) -> bool:
+    """Whether the disturbance set changes."""
+    return bool(jax.tree.leaves(along.changes.data.disturbances))
+
+
+def is_compact(along: Along) -> bool:
+    """Whether the adjoints below are free of library calls and large reductions, see `Along.adjoint`.
+
+    With respect to the disturbance set there are reductions, and what comes with actuators is JAX's own transpose.
+    """
+    return along.arguments.data.actuation is None and not set_changes(along)
+
+
+def _central_adjoint(
+    objective: Objective, cone_edges: int, with_terms: bool, grasps: Grasps, point: Point, cotangents: Point
+) -> Grasps:
     """From cotangents of a central point to those of the data: one solve with the symmetric matrix."""
     if grasps.actuated is not None:
-        return _actuated_adjoint(cone_edges, grasps, point, cotangents)
+        return _actuated_adjoint(objective, cone_edges, grasps, point, cotangents)
     program = scaled_program(grasps, cone_edges)
-    problem, unit = _problem(grasps, program)
-    (group,), kappa = problem.groups, central_kappa(grasps, program, unit)
-    iterate = _iterate(problem, program, point, unit, kappa)
+    problem, unit = objective.problem(grasps, program)
+    (group,), kappa = problem.groups, central_kappa(objective, grasps, unit)
+    iterate = iterate_of(problem, program, point, unit, kappa)
     (z,), (s,) = iterate.z, iterate.s
     forces = jnp.where(point.usable, point.forces, 0)
     scales = jnp.stack([program.tangential, program.tangential, program.normal])
@@ -169,7 +158,7 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
     effort_weights = None
     if ct.effort is not None:
-        pull = pull + ct.effort * weighed(forces, grasps.weights)
+        pull = pull + ct.effort * weighed(forces, grasps.options.effort_weights)
         effort_weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
     right_x = jnp.moveaxis(pull, 1, 0) * scales * grasps.present
     cone = jnp.zeros_like(z[:-1]) if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)
@@ -195,7 +184,7 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
     move_y = program.wrench_multipliers(move_y, jnp.ones_like(grasps.units))
     normal = literal(pyramid_facets(cone_edges)[:, 2], z.dtype)[:, None, None]
     asked = None
-    if grasps.margin is not None:
+    if isinstance(objective, LeastEffort):
         asked = total(values * group.sigma * row_units) / program.scale
         asked = asked if ct.margin is None else asked + ct.margin
         bend = -0.5 / unit * (force[:, None] * move + move[:, None] * force)
@@ -209,20 +198,21 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
         friction=fold(jnp.add, normal * (values[:-1] * force[2] - z[:-1] * move[2])),
         columns=-(y[:, None, None] * move + move_y[:, None, None] * force),
         wrench=move_y,
-        weights=None if grasps.weights is None else effort_weights,
+        weights=None if grasps.options.effort_weights is None else effort_weights,
         margin=asked,
     )
-    return _to_grasps(grasps, rows, cone_edges, names)
+    return _to_grasps(grasps, rows, cone_edges, with_terms)
 
 
 def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: jax.Array) -> Grasps:
     """`envelope_adjoint` for a hand, through the scaled program by JAX's own hand."""
     program = scaled_program(grasps, cone_edges)
-    problem, unit = _problem(grasps, program)
-    iterate = _iterate(problem, program, point, unit, None)
+    objective = LargestMargin()
+    problem, unit = objective.problem(grasps, program)
+    iterate = iterate_of(problem, program, point, unit, None)
 
     def value(grasps: Grasps) -> jax.Array:
-        moved = _problem(grasps, scaled_program(grasps, cone_edges))[0]
+        moved = objective.problem(grasps, scaled_program(grasps, cone_edges))[0]
         residuals = moved.residuals(iterate)
         terms = jax.tree.map(jnp.multiply, (iterate.z, iterate.y), (residuals.rows, residuals.primal))
         return -jnp.sum(weight * unit * reduce_rows(jnp.add, terms, weight.ndim))
@@ -230,14 +220,15 @@ def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: 
     return jax.grad(value, allow_int=True)(grasps)
 
 
-def _actuated_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: Point) -> Grasps:
+def _actuated_adjoint(objective: Objective, cone_edges: int, grasps: Grasps, point: Point, cotangents: Point) -> Grasps:
     """`_central_adjoint` for a hand, through the scaled program by JAX's own hand."""
     program = scaled_program(grasps, cone_edges)
-    problem, unit = _problem(grasps, program)
-    iterate = _iterate(problem, program, point, unit, central_kappa(grasps, program, unit))
+    problem, unit = objective.problem(grasps, program)
+    iterate = iterate_of(problem, program, point, unit, central_kappa(objective, grasps, unit))
 
     def read(grasps: Grasps, iterate: Iterate) -> Point:
-        return _point(grasps, scaled_program(grasps, cone_edges), iterate, unit, point.usable)._replace(usable=None)
+        moved = point_of(objective, grasps, scaled_program(grasps, cone_edges), iterate, unit, point.usable)
+        return moved._replace(usable=None)
 
     out, pull = jax.vjp(read, grasps, iterate)
     given = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)
@@ -250,77 +241,9 @@ def _actuated_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents:
     moves = ((move_x, move_lambda) if problem.bordered else move_x, move_y, move_z)
 
     def lack(grasps: Grasps) -> jax.Array:
-        residuals = _problem(grasps, scaled_program(grasps, cone_edges))[0].residuals(iterate)
+        residuals = objective.problem(grasps, scaled_program(grasps, cone_edges))[0].residuals(iterate)
         terms = jax.tree.map(jnp.multiply, moves, (residuals.dual, residuals.primal, residuals.rows))
         return -jnp.sum(jnp.where(point.usable, reduce_rows(jnp.add, terms, unit.ndim), 0))
 
     indirect = jax.grad(lack, allow_int=True)(grasps)
     return jax.tree.map(lambda a, b: a if a.dtype == jax.dtypes.float0 else a + b, direct, indirect)
-
-
-def central_kappa(grasps: Grasps, program: Program, unit: jax.Array) -> jax.Array:
-    """What s z is at the central point, scaled, (*lanes), for an objective in the given unit."""
-    if grasps.smoothing is not None:
-        return grasps.smoothing / unit
-    return jnp.full_like(program.scale, _KAPPA[program.scale.dtype.name][grasps.margin is not None])
-
-
-def centred(grasps: Grasps, program: Program, start: Iterate, active: jax.Array) -> Point:
-    """The central point that Newton's method finds from a start near by."""
-    problem, unit = _problem(grasps, program)
-    kappa = central_kappa(grasps, program, unit)
-    centre = central_point(problem, start, kappa, active)
-    found = active & (centre.error <= _FOUND[kappa.dtype.name])
-    return _point(grasps, program, centre.iterate, unit, found)
-
-
-def _problem(grasps: Grasps, program: Program) -> tuple[BlockProblem, jax.Array]:
-    """The problem, and what its objective is measured in."""
-    if grasps.margin is None:
-        return margin_problem(program), program.scale
-    effort = effort_problem(grasps, program)
-    return effort.problem, effort.unit**2
-
-
-def _point(grasps: Grasps, program: Program, iterate: Iterate, unit: jax.Array, usable: jax.Array) -> Point:
-    blocks, margin = (iterate.x, grasps.margin) if grasps.margin is not None else iterate.x
-    forces = program.forces(blocks[0]) * grasps.present[:, None]
-    multipliers = iterate.z[0] * unit / program.row_units()
-    actuated = actuated_values(program, blocks, iterate, grasps.units, unit)
-    return Point(
-        margin=margin if grasps.margin is not None else margin * program.scale,
-        forces=forces,
-        effort=effort_of(forces, grasps.weights),
-        cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
-        bound_multipliers=multipliers[-1],
-        wrench_multipliers=program.wrench_multipliers(iterate.y, grasps.units) * unit,
-        usable=usable,
-        **actuated,
-    )
-
-
-def _iterate(
-    problem: BlockProblem, program: Program, point: Point, unit: jax.Array, kappa: jax.Array | None
-) -> Iterate:
-    """The scaled iterate; s from s z = kappa, or from the rows where kappa is None. Harmless where of no use."""
-    clean = lambda x, other: jnp.where(point.usable, x, other)
-    forces = clean(jnp.moveaxis(point.forces, 1, 0), 0) * program.present
-    x = [forces / jnp.stack([program.tangential, program.tangential, program.normal])]
-    z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
-    z = [clean(z * program.row_units() / unit, 1) * program.present]
-    if program.efforts is not None:
-        assert point.actuator_multipliers is not None
-        x.append((clean(point.actuator_efforts, 0) / program.efforts.unit)[None])
-        z.append(clean(jnp.moveaxis(point.actuator_multipliers, 1, 0) * program.efforts.unit / unit, 1))
-    lam = clean(point.margin, 0) / program.scale
-    s, pull = [], []
-    for group, x_g, z_g in zip(problem.groups, x, z, strict=True):
-        if kappa is None:
-            slack = group.h - apply_rows(group, x_g) - (group.sigma * lam if problem.bordered else 0)
-        else:
-            slack = kappa / jnp.where(group.present > 0, z_g, 1)
-        s.append(jnp.where(group.present > 0, clean(slack, 1), 1))
-        stationary = adjoint_rows(group, z_g)
-        pull.append(stationary if group.hessian is None else stationary + apply_hessian(group, x_g))
-    blocks, y = tuple(x), -problem.equality(tuple(pull))
-    return Iterate((blocks, lam) if problem.bordered else blocks, y, tuple(s), tuple(z))

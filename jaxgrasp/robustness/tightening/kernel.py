@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,9 @@ from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.decisions import evidence
-from jaxgrasp.robustness.tightening.derivatives import CentralPoint, Point
+from jaxgrasp.robustness.tightening.derivatives import CentralPoint
+from jaxgrasp.robustness.tightening.objectives import Objective
+from jaxgrasp.robustness.tightening.points import Point
 from jaxgrasp.robustness.tightening.program import Program, prepared
 from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.status import Status
@@ -23,7 +26,10 @@ from jaxgrasp.solvers.status import Status
 class Tightening(OfPyramids, Audited, ABC):
     """The common part of the kernels of (21) and (22), whose results are a solution and evidence for its audit."""
 
+    objective: ClassVar[Objective]
+    """Which of the two programs this is."""
     smooth: bool
+    """Whether the central point is asked for in place of the optimum."""
     evident: bool = True
     """Whether the kernel writes evidence; without an audit nobody reads it."""
 
@@ -58,7 +64,7 @@ class Tightening(OfPyramids, Audited, ABC):
 
     def _central(self, along: Along, point: Point) -> Point:
         """The derivative of everything at the central point, which is the point itself where smoothing is asked for."""
-        kernel = CentralPoint(self.cone_edges)
+        kernel = CentralPoint(self.cone_edges, self.objective)
         return kernel.tangents(along, point if self.smooth else along.value(kernel, point))
 
 

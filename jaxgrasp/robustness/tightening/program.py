@@ -22,9 +22,7 @@ from jaxgrasp.lanes.fence import fenced
 from jaxgrasp.robustness.actuators import EffortRows, effort_unit, joined_rows, packed, unpacked
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.worst_case import reach_outside, worst_rows
-from jaxgrasp.solvers.block.effort import EffortProblem, least_curvature
 from jaxgrasp.solvers.block.kkt import Blocks, Record, Rows, total
-from jaxgrasp.solvers.block.margin import MarginProblem
 from jaxgrasp.solvers.interior_point import Iterate
 
 # Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
@@ -277,60 +275,3 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
     doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
     doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)
     return doubtful if len(ratios) == 6 else doubtful | ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)
-
-
-_REFINEMENTS = {"float64": 0, "float32": 1}
-
-
-def margin_problem(program: Program, cutoff: jax.Array | None = None) -> MarginProblem:
-    """(21); a margin below the cutoff, in units of the disturbances, is of no interest."""
-    refinements = _REFINEMENTS[program.rhs.dtype.name]
-    cutoff = None if cutoff is None else cutoff / program.scale
-    return MarginProblem(program.groups, program.rhs, program.dropped, program.radius, refinements, cutoff)
-
-
-class Effort(NamedTuple):
-    """(22): the problem (without a guess), the scaled margin that is asked for, and sqrt of the unit of effort."""
-
-    problem: EffortProblem
-    wanted: jax.Array
-    unit: jax.Array
-
-
-def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort:
-    """(22)."""
-    blocks, *others = program.groups
-    dtype = program.rhs.dtype
-    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.asked / program.scale)
-    eye = jnp.eye(3, dtype=dtype)[..., None, None]
-    # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
-    root = eye if grasps.weight_roots is None else grasps.weight_roots
-    root = root * jnp.stack([program.tangential, program.tangential, program.normal]) * blocks.present
-    largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
-    largest = jnp.where(largest > 0, largest, 1)
-
-    def held(group: Blocks, hessian: jax.Array) -> Blocks:
-        return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * wanted, hessian=hessian)
-
-    # The actuators' efforts cost nothing.
-    groups = (held(blocks, root / largest), *[held(g, jnp.zeros_like(g.present)[None, None]) for g in others])
-    problem = EffortProblem(
-        groups,
-        program.rhs,
-        program.dropped,
-        program.radius,
-        _REFINEMENTS[dtype.name],
-        guess,
-        tuple(least_curvature(g.root) for g in groups),
-    )
-    return Effort(problem, wanted, largest)
-
-
-def weighed(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """Q_0 f of forces (n, 3, *lanes); weights None for Q_0 = I."""
-    return forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
-
-
-def effort_of(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
-    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed(forces, weights)))
