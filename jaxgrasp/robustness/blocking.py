@@ -46,13 +46,13 @@ class _BlockingForces(Plain):
 
     def evaluate(self, grasps: Grasps) -> jax.Array:
         scaled = wrenches_of(grasps.terms) * grasps.units
-        if grasps.vertex_halves is None:
-            inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+        if grasps.vertex_inverse_roots is None:
+            inverse = pseudo_inverse(grasps.columns, grasps.inverse_root)[0]
             # Spelt out: products of matrices are library calls, which a tile cannot make.
             parts = [jnp.moveaxis(inverse[:, e], 0, 1) * scaled[:, e][:, None, None] for e in range(6)]
             forces = -fold(jnp.add, parts)
         else:
             one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])
-            forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
+            forces = jax.lax.map(one, (grasps.vertex_inverse_roots, scaled))
         forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
         return jnp.where(grasps.valid, forces, jnp.nan)

@@ -20,7 +20,7 @@ from jaxgrasp.kernels import usable
 from jaxgrasp.lanes.differentiable import Kernel, Lanes, differentiable
 from jaxgrasp.lanes.direct import cut
 from jaxgrasp.lanes.tiles import LOOSE_TILE, TILE
-from jaxgrasp.robustness.actuators import Actuated, limited, stacked_rows
+from jaxgrasp.robustness.actuators import Actuated, clip_limits, stack_rows
 from jaxgrasp.robustness.auditing import audited
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs, Options, laid_out
 from jaxgrasp.robustness.interface.sizes import with_a_known_size
@@ -58,9 +58,9 @@ class Grasps:
     """The disturbance set, moments in N m; leaves may have lanes of size 1."""
     extents: tuple[jax.Array, ...]
     """The largest |w_i| of every term of the disturbance set, (6, *lanes) each, N and N m."""
-    half: jax.Array | None
+    inverse_root: jax.Array | None
     """M with M M' = Q^-1, see `inverse_root`; None for Q = I."""
-    vertex_halves: jax.Array | None
+    vertex_inverse_roots: jax.Array | None
     """M for each vertex of the disturbance set, along the leading axis."""
     weight_roots: jax.Array | None
     """(3, 3, n, *lanes), R with R'R = Q_0; None for Q_0 = I."""
@@ -72,7 +72,7 @@ class Grasps:
     @property
     def rows(self) -> jax.Array:
         """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
-        return stacked_rows(self.columns, self.actuated)
+        return stack_rows(self.columns, self.actuated)
 
 
 def over_grasps(kernel: Kernel, data: GraspData, options: Options | None = None) -> Any:
@@ -126,7 +126,7 @@ def admit(inputs: Inputs) -> Grasps:
     load = data.required_wrench
     assert load is not None
     valid = _usable_contacts(contacts)
-    half, vertex_halves, usable = _roots_of_compliance(data.compliance, active)
+    root, vertex_roots, usable = _roots_of_compliance(data.compliance, active)
     valid &= usable
     weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, active, valid)
     valid &= usable
@@ -150,7 +150,7 @@ def admit(inputs: Inputs) -> Grasps:
     actuated = None
     if data.actuation is not None:
         actuated = _admit_actuation(data.actuation, present, valid, length)
-        actuated = limited(actuated, friction, jnp.where(present, max_force, 0))
+        actuated = clip_limits(actuated, friction, jnp.where(present, max_force, 0))
     return Grasps(
         valid=valid,
         present=present.astype(positions.dtype),
@@ -164,8 +164,8 @@ def admit(inputs: Inputs) -> Grasps:
         reserve=jnp.where(valid, data.cone_margin, 0),
         terms=data.disturbances.terms,
         extents=inputs.extents,
-        half=half,
-        vertex_halves=vertex_halves,
+        inverse_root=root,
+        vertex_inverse_roots=vertex_roots,
         weight_roots=weight_roots,
         options=replace(options, effort_weights=weights),
         actuated=actuated,

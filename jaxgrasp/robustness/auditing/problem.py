@@ -11,7 +11,7 @@ from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.terms import Term
-from jaxgrasp.robustness.actuators import Actuated, limited
+from jaxgrasp.robustness.actuators import Actuated, clip_limits
 from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
 
 
@@ -101,7 +101,7 @@ def problem_of(arguments: Arguments) -> Problem:
 
 def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_force: jax.Array) -> Hand:
     last = lambda x: jnp.moveaxis(x, 0, -1)
-    limits = limited(
+    limits = clip_limits(
         Actuated(
             joints=jnp.moveaxis(jacobian, (3, 2, 1, 0), (0, 1, 2, 3)),
             transmission=last(actuation.transmission),

@@ -172,12 +172,12 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
 
 def blocking(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
     """-G*_j W_j (n_d, 3, n, *lanes) of wrenches (6, n_d, *lanes), N."""
-    if grasps.vertex_halves is None:
-        inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+    if grasps.vertex_inverse_roots is None:
+        inverse = pseudo_inverse(grasps.columns, grasps.inverse_root)[0]
         forces = -jnp.einsum("aen...,ed...->dan...", inverse, wrenches)
     else:
         one = lambda each: -jnp.einsum("aen...,e...->an...", pseudo_inverse(grasps.columns, each[0])[0], each[1])
-        forces = lax.map(one, (grasps.vertex_halves, jnp.swapaxes(wrenches, 0, 1)))
+        forces = lax.map(one, (grasps.vertex_inverse_roots, jnp.swapaxes(wrenches, 0, 1)))
     return jnp.where(grasps.present > 0, forces, 0)
 
 

@@ -245,8 +245,8 @@ def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) 
 
     own = scaled(None if weights is None else jnp.moveaxis(weights, 0, 2))
     change = None
-    if grasps.half is not None:
-        inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.half, grasps.half)
+    if grasps.inverse_root is not None:
+        inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.inverse_root, grasps.inverse_root)
         change = jnp.moveaxis(jnp.linalg.inv(inverse), (0, -2, -1), (2, 0, 1))
     change = scaled(change)
     largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (own, change)])

@@ -23,7 +23,7 @@ from jaxgrasp.lanes.differentiable import Along, OfPyramids
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.tightening.objectives import LargestMargin, LeastEffort, Objective, weighed
 from jaxgrasp.robustness.tightening.points import Point, central_kappa, centred, iterate_of, point_of
-from jaxgrasp.robustness.tightening.program import Program, prepared, scaled_program
+from jaxgrasp.robustness.tightening.program import ScaledProgram, prepare, scale_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
 from jaxgrasp.solvers.block.kkt import total
 from jaxgrasp.solvers.block.sensitivity import solve_symmetric
@@ -79,11 +79,13 @@ def envelope_adjoint(cone_edges: int, with_terms: bool, grasps: Grasps, point: P
 def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, with_terms: bool) -> Grasps:
     """Cotangents of the data, from those of the rows."""
     zero = jax.tree.map(_nothing, grasps)
-    columns, friction, half, terms = reach_adjoint(grasps, rows.cone_reach, rows.bound_reach, cone_edges, with_terms)
-    if grasps.vertex_halves is not None:
-        zero = replace(zero, vertex_halves=half)
-    elif grasps.half is not None:
-        zero = replace(zero, half=half)
+    columns, friction, inverse_root, terms = reach_adjoint(
+        grasps, rows.cone_reach, rows.bound_reach, cone_edges, with_terms
+    )
+    if grasps.vertex_inverse_roots is not None:
+        zero = replace(zero, vertex_inverse_roots=inverse_root)
+    elif grasps.inverse_root is not None:
+        zero = replace(zero, inverse_root=inverse_root)
     if rows.weights is not None:
         zero = replace(zero, options=replace(zero.options, effort_weights=rows.weights))
     if rows.margin is not None:
@@ -113,9 +115,9 @@ class CentralPoint(OfPyramids):
     @property
     def stages(self) -> tuple:
         """See `Kernel`; the point is held."""
-        return (lambda grasps, point: (*prepared(grasps, self.cone_edges), point), lambda given: self._find(*given))
+        return (lambda grasps, point: (*prepare(grasps, self.cone_edges), point), lambda given: self._find(*given))
 
-    def _find(self, grasps: Grasps, program: Program, point: Point) -> Point:
+    def _find(self, grasps: Grasps, program: ScaledProgram, point: Point) -> Point:
         problem, unit = self.objective.problem(grasps, program)
         return centred(self.objective, grasps, program, iterate_of(problem, program, point, unit, None), point.usable)
 
@@ -144,7 +146,7 @@ def _central_adjoint(
     """From cotangents of a central point to those of the data: one solve with the symmetric matrix."""
     if grasps.actuated is not None:
         return _actuated_adjoint(objective, cone_edges, grasps, point, cotangents)
-    program = scaled_program(grasps, cone_edges)
+    program = scale_program(grasps, cone_edges)
     problem, unit = objective.problem(grasps, program)
     (group,), kappa = problem.groups, central_kappa(objective, grasps, unit)
     iterate = iterate_of(problem, program, point, unit, kappa)
@@ -206,13 +208,13 @@ def _central_adjoint(
 
 def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: jax.Array) -> Grasps:
     """`envelope_adjoint` for a hand, through the scaled program by JAX's own hand."""
-    program = scaled_program(grasps, cone_edges)
+    program = scale_program(grasps, cone_edges)
     objective = LargestMargin()
     problem, unit = objective.problem(grasps, program)
     iterate = iterate_of(problem, program, point, unit, None)
 
     def value(grasps: Grasps) -> jax.Array:
-        moved = objective.problem(grasps, scaled_program(grasps, cone_edges))[0]
+        moved = objective.problem(grasps, scale_program(grasps, cone_edges))[0]
         residuals = moved.residuals(iterate)
         terms = jax.tree.map(jnp.multiply, (iterate.z, iterate.y), (residuals.rows, residuals.primal))
         return -jnp.sum(weight * unit * reduce_rows(jnp.add, terms, weight.ndim))
@@ -222,12 +224,12 @@ def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: 
 
 def _actuated_adjoint(objective: Objective, cone_edges: int, grasps: Grasps, point: Point, cotangents: Point) -> Grasps:
     """`_central_adjoint` for a hand, through the scaled program by JAX's own hand."""
-    program = scaled_program(grasps, cone_edges)
+    program = scale_program(grasps, cone_edges)
     problem, unit = objective.problem(grasps, program)
     iterate = iterate_of(problem, program, point, unit, central_kappa(objective, grasps, unit))
 
     def read(grasps: Grasps, iterate: Iterate) -> Point:
-        moved = point_of(objective, grasps, scaled_program(grasps, cone_edges), iterate, unit, point.usable)
+        moved = point_of(objective, grasps, scale_program(grasps, cone_edges), iterate, unit, point.usable)
         return moved._replace(usable=None)
 
     out, pull = jax.vjp(read, grasps, iterate)
@@ -241,7 +243,7 @@ def _actuated_adjoint(objective: Objective, cone_edges: int, grasps: Grasps, poi
     moves = ((move_x, move_lambda) if problem.bordered else move_x, move_y, move_z)
 
     def lack(grasps: Grasps) -> jax.Array:
-        residuals = objective.problem(grasps, scaled_program(grasps, cone_edges))[0].residuals(iterate)
+        residuals = objective.problem(grasps, scale_program(grasps, cone_edges))[0].residuals(iterate)
         terms = jax.tree.map(jnp.multiply, moves, (residuals.dual, residuals.primal, residuals.rows))
         return -jnp.sum(jnp.where(point.usable, reduce_rows(jnp.add, terms, unit.ndim), 0))
 

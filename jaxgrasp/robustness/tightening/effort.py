@@ -20,7 +20,7 @@ from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.decisions import solve_effort, solve_margin
 from jaxgrasp.robustness.tightening.kernel import Tightening, changed
 from jaxgrasp.robustness.tightening.objectives import LeastEffort
-from jaxgrasp.robustness.tightening.program import Program
+from jaxgrasp.robustness.tightening.program import ScaledProgram
 
 
 def least_effort(
@@ -83,7 +83,7 @@ def least_effort(
 class _LeastEffort(Tightening):
     objective = LeastEffort()
 
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
+    def _solve(self, grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Evidence | None]:
         first, record, _ = solve_margin(replace(grasps, options=replace(grasps.options, smoothing=None)), program)
         return solve_effort(grasps, program, first, record), self._evidence(grasps, program, record)
 

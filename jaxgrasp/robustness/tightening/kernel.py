@@ -17,7 +17,7 @@ from jaxgrasp.robustness.tightening.decisions import evidence
 from jaxgrasp.robustness.tightening.derivatives import CentralPoint
 from jaxgrasp.robustness.tightening.objectives import Objective
 from jaxgrasp.robustness.tightening.points import Point
-from jaxgrasp.robustness.tightening.program import Program, prepared
+from jaxgrasp.robustness.tightening.program import ScaledProgram, prepare
 from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.status import Status
 
@@ -36,12 +36,12 @@ class Tightening(OfPyramids, Audited, ABC):
     @property
     def stages(self) -> tuple:
         """Scale the grasps, then solve them."""
-        return (lambda grasps, _: prepared(grasps, self.cone_edges), lambda given: self._solve(*given))
+        return (lambda grasps, _: prepare(grasps, self.cone_edges), lambda given: self._solve(*given))
 
     @abstractmethod
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]: ...
+    def _solve(self, grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Evidence | None]: ...
 
-    def _evidence(self, grasps: Grasps, program: Program, record: Record) -> Evidence | None:
+    def _evidence(self, grasps: Grasps, program: ScaledProgram, record: Record) -> Evidence | None:
         return evidence(grasps, program, record) if self.evident else None
 
     def judge(self, arguments: Arguments, out: tuple[Solution, Evidence], anew: bool) -> Verdict:

@@ -20,7 +20,7 @@ from jaxgrasp.robustness.tightening.decisions import at_centre, solve_margin
 from jaxgrasp.robustness.tightening.derivatives import envelope_adjoint, is_compact, set_changes
 from jaxgrasp.robustness.tightening.kernel import Tightening, changed
 from jaxgrasp.robustness.tightening.objectives import LargestMargin
-from jaxgrasp.robustness.tightening.program import Program
+from jaxgrasp.robustness.tightening.program import ScaledProgram
 from jaxgrasp.solvers.status import Status
 
 
@@ -86,7 +86,7 @@ def largest_disturbance(
 class _LargestDisturbance(Tightening):
     objective = LargestMargin()
 
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
+    def _solve(self, grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Evidence | None]:
         best, record, iterate = solve_margin(grasps, program)
         solution = best
         if grasps.options.smoothing is not None:

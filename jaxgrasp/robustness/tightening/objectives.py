@@ -10,7 +10,7 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.program import Program
+from jaxgrasp.robustness.tightening.program import ScaledProgram
 from jaxgrasp.solvers.block.effort import EffortProblem, least_curvature
 from jaxgrasp.solvers.block.kkt import BlockProblem, Blocks, Rows
 from jaxgrasp.solvers.block.margin import MarginProblem
@@ -18,7 +18,7 @@ from jaxgrasp.solvers.block.margin import MarginProblem
 _REFINEMENTS = {"float64": 0, "float32": 1}
 
 
-def margin_problem(program: Program, cutoff: jax.Array | None = None) -> MarginProblem:
+def margin_problem(program: ScaledProgram, cutoff: jax.Array | None = None) -> MarginProblem:
     """(21); a margin below the cutoff, in units of the disturbances, is of no interest."""
     refinements = _REFINEMENTS[program.rhs.dtype.name]
     cutoff = None if cutoff is None else cutoff / program.scale
@@ -33,7 +33,7 @@ class Effort(NamedTuple):
     unit: jax.Array
 
 
-def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort:
+def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> Effort:
     """(22)."""
     blocks, *others = program.groups
     dtype, asked = program.rhs.dtype, grasps.options.margin
@@ -80,11 +80,11 @@ class Objective(ABC):
     """kappa of the central points whose derivatives stand for those of exact forces, in the solver's units."""
 
     @abstractmethod
-    def problem(self, grasps: Grasps, program: Program) -> tuple[BlockProblem, jax.Array]:
+    def problem(self, grasps: Grasps, program: ScaledProgram) -> tuple[BlockProblem, jax.Array]:
         """The problem, and the unit of its objective, (*lanes)."""
 
     @abstractmethod
-    def forces_and_margin(self, x: Any, grasps: Grasps, program: Program) -> tuple[Rows, jax.Array]:
+    def forces_and_margin(self, x: Any, grasps: Grasps, program: ScaledProgram) -> tuple[Rows, jax.Array]:
         """The scaled forces and efforts of unknowns x, and the margin that belongs to them, (*lanes)."""
 
 
@@ -95,11 +95,11 @@ class LargestMargin(Objective):
     # Many forces may be optimal, and what tells them apart has a share of kappa^2: below 1e-6 rounding is felt.
     kappa = {"float64": 1e-6, "float32": 1e-4}
 
-    def problem(self, grasps: Grasps, program: Program) -> tuple[BlockProblem, jax.Array]:
+    def problem(self, grasps: Grasps, program: ScaledProgram) -> tuple[BlockProblem, jax.Array]:
         """(21), in units of the natural scale of margins."""
         return margin_problem(program), program.scale
 
-    def forces_and_margin(self, x: Any, grasps: Grasps, program: Program) -> tuple[Rows, jax.Array]:
+    def forces_and_margin(self, x: Any, grasps: Grasps, program: ScaledProgram) -> tuple[Rows, jax.Array]:
         """Lambda is an unknown."""
         blocks, margin = x
         return blocks, margin * program.scale
@@ -111,12 +111,12 @@ class LeastEffort(Objective):
 
     kappa = {"float64": 1e-8, "float32": 1e-5}
 
-    def problem(self, grasps: Grasps, program: Program) -> tuple[BlockProblem, jax.Array]:
+    def problem(self, grasps: Grasps, program: ScaledProgram) -> tuple[BlockProblem, jax.Array]:
         """(22), in units of the effort."""
         effort = effort_problem(grasps, program)
         return effort.problem, effort.unit**2
 
-    def forces_and_margin(self, x: Any, grasps: Grasps, program: Program) -> tuple[Rows, jax.Array]:
+    def forces_and_margin(self, x: Any, grasps: Grasps, program: ScaledProgram) -> tuple[Rows, jax.Array]:
         """Lambda is given."""
         assert grasps.options.margin is not None
         return x, grasps.options.margin

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.tightening.objectives import Objective, effort_of
-from jaxgrasp.robustness.tightening.program import Program, actuated_values
+from jaxgrasp.robustness.tightening.program import ScaledProgram, actuated_values
 from jaxgrasp.solvers.block.kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows
 from jaxgrasp.solvers.block.sensitivity import central_point
 from jaxgrasp.solvers.interior_point import Iterate
@@ -39,7 +39,7 @@ def central_kappa(objective: Objective, grasps: Grasps, unit: jax.Array) -> jax.
     return jnp.full_like(grasps.length, objective.kappa[grasps.length.dtype.name])
 
 
-def centred(objective: Objective, grasps: Grasps, program: Program, start: Iterate, active: jax.Array) -> Point:
+def centred(objective: Objective, grasps: Grasps, program: ScaledProgram, start: Iterate, active: jax.Array) -> Point:
     """The central point that Newton's method finds from a start near by."""
     problem, unit = objective.problem(grasps, program)
     kappa = central_kappa(objective, grasps, unit)
@@ -49,7 +49,7 @@ def centred(objective: Objective, grasps: Grasps, program: Program, start: Itera
 
 
 def point_of(
-    objective: Objective, grasps: Grasps, program: Program, iterate: Iterate, unit: jax.Array, usable: jax.Array
+    objective: Objective, grasps: Grasps, program: ScaledProgram, iterate: Iterate, unit: jax.Array, usable: jax.Array
 ) -> Point:
     """The point of a scaled iterate, for an objective in the given unit."""
     blocks, margin = objective.forces_and_margin(iterate.x, grasps, program)
@@ -69,7 +69,7 @@ def point_of(
 
 
 def iterate_of(
-    problem: BlockProblem, program: Program, point: Point, unit: jax.Array, kappa: jax.Array | None
+    problem: BlockProblem, program: ScaledProgram, point: Point, unit: jax.Array, kappa: jax.Array | None
 ) -> Iterate:
     """The scaled iterate; s from s z = kappa, or from the rows where kappa is None. Harmless where of no use."""
     clean = lambda x, other: jnp.where(point.usable, x, other)
@@ -77,10 +77,10 @@ def iterate_of(
     x = [forces / jnp.stack([program.tangential, program.tangential, program.normal])]
     z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
     z = [clean(z * program.row_units() / unit, 1) * program.present]
-    if program.efforts is not None:
+    if program.actuators is not None:
         assert point.actuator_multipliers is not None
-        x.append((clean(point.actuator_efforts, 0) / program.efforts.unit)[None])
-        z.append(clean(jnp.moveaxis(point.actuator_multipliers, 1, 0) * program.efforts.unit / unit, 1))
+        x.append((clean(point.actuator_efforts, 0) / program.actuators.unit)[None])
+        z.append(clean(jnp.moveaxis(point.actuator_multipliers, 1, 0) * program.actuators.unit / unit, 1))
     lam = clean(point.margin, 0) / program.scale
     s, pull = [], []
     for group, x_g, z_g in zip(problem.groups, x, z, strict=True):
