@@ -304,14 +304,7 @@ def solve_effort(grasps: Grasps, program: ScaledProgram, first: Solution, record
     closed &= _margin_closed(program, first)
     # A row that lambda hardly moves turns the little that it is missed by into much of lambda.
     attained = jnp.where(closed, jnp.maximum(attained, wanted), attained)
-    out_of_reach = hopeless | ~reachable & ~program.undisturbed
-    cases = [
-        Case(~grasps.valid, Status.INVALID_INPUT),
-        Case(hopeless, Status.INFEASIBLE),
-        Case(program.doubtful, Status.ILL_CONDITIONED),
-        Case(out_of_reach, Status.INFEASIBLE),
-        Case(active & closed, Status.SOLVED),
-    ]
+    cases = effort_cases(grasps, program, hopeless, reachable, active, closed)
     status = _first([(case.when, case.status) for case in cases], Status.MAX_ITERATIONS).astype(jnp.int32)
 
     has_forces = active & jnp.isfinite(best.upper)
@@ -340,6 +333,34 @@ def solve_effort(grasps: Grasps, program: ScaledProgram, first: Solution, record
     if grasps.options.smoothing is None:
         return solution
     return at_centre(LeastEffort(), grasps, program, outcome.iterate, solution, active & ~forceless)
+
+
+def effort_cases(
+    grasps: Grasps,
+    program: ScaledProgram,
+    hopeless: jax.Array,
+    reachable: jax.Array,
+    active: jax.Array,
+    closed: jax.Array,
+) -> list[Case]:
+    """The decision table of (22); a lane for which no case applies ran out of iterations.
+
+    Args:
+        grasps: the grasps.
+        program: their scaled programs.
+        hopeless: even b cannot be borne.
+        reachable: the margin that is asked for is within (21)'s bound.
+        active: (22) was solved.
+        closed: the bounds are close and the rows were the right ones.
+    """
+    out_of_reach = hopeless | ~reachable & ~program.undisturbed
+    return [
+        Case(~grasps.valid, Status.INVALID_INPUT),
+        Case(hopeless, Status.INFEASIBLE),
+        Case(program.doubtful, Status.ILL_CONDITIONED),
+        Case(out_of_reach, Status.INFEASIBLE),
+        Case(active & closed, Status.SOLVED),
+    ]
 
 
 def _margin_closed(program: ScaledProgram, first: Solution) -> jax.Array:

@@ -1,12 +1,33 @@
-"""How the answers of (21) and (22) vary with everything that they depend on.
+"""How the results of (21) and (22) vary with everything that they depend on.
 
 The margin of (21) by the envelope theorem: d margin is the partial derivative of the Lagrangian
 
-    lambda - z_1'(C f_0 - S_1 lambda + d) - z_2'(-E f_0 + S_2 lambda - f_max) - y'(G f_0 - b)
+    lambda - z_1'(C f - S_1 lambda + d) - z_2'(-E f + S_2 lambda - f_max) - y'(G f - b)
 
-with forces, margin and multipliers held: no linear system is solved, and the margin may be negative. Everything else,
-and the margin itself where smoothing is asked for, by the implicit function theorem at a central point, see
-`sensitivity`.
+with forces, margin and multipliers held. No linear system is solved, and the margin may be negative.
+
+Everything else, and the margin itself where smoothing is asked for, by the implicit function theorem at a central point
+u = (x, lambda, y, z), where F(u, data) = 0: F is the gradient of the Lagrangian
+
+    L = objective + y'(E x - b) + sum_i z_i (a_i'x + sigma_i lambda - h_i)
+
+with respect to u, but for kappa / z_i in the rows, which no data enter. K = dF/du is the symmetric matrix of
+`solvers.block.sensitivity`, so a cotangent c of u becomes
+
+    c'du = -m'dF,   K m = c,
+
+with dF taken at u held. As F is a gradient, m'F is the derivative of L along m: a row r_i = a_i'x + sigma_i lambda -
+h_i adds m_z r_i + z_i (a_i'm_x + sigma_i m_lambda), the equalities add m_y'(E x - b) + y'E m_x, and the objective of
+(22) adds m_x'H x. From this follow the cotangents of the data, `RowWeights`:
+
+    row value      -m_z                          sigma    -(m_z lambda + z m_lambda)
+    b               m_y                          G        -(y m_x' + m_y x')
+    Q_0            -1/2 (x m_x' + m_x x')        mu       -(m_z f_n + z m_n) times the facet's share of mu f_n
+
+and (22)'s lambda, which is data there, gets -m_z'sigma. `reach_adjoint` takes S_1 and S_2 back to the grasps.
+
+Both are written out for grasps without actuators: free of large reductions and library calls, they can be native
+kernels. With actuators JAX transposes the scaled program itself.
 """
 
 from dataclasses import dataclass, replace
@@ -25,17 +46,17 @@ from jaxgrasp.robustness.tightening.objectives import LargestMargin, LeastEffort
 from jaxgrasp.robustness.tightening.points import Point, central_kappa, centred, iterate_of, point_of
 from jaxgrasp.robustness.tightening.program import ScaledProgram, prepare, scale_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
-from jaxgrasp.solvers.block.kkt import total
+from jaxgrasp.solvers.block.kkt import BlockProblem, total
 from jaxgrasp.solvers.block.sensitivity import solve_symmetric
 from jaxgrasp.solvers.interior_point import Iterate, reduce_rows
 
 
 class RowWeights(NamedTuple):
-    """What a cotangent asks of the rows: of C f + h lambda + d and -f_n + h lambda - f_max, with h = -S_1 or S_2.
+    """Cotangents of what the rows C f + h lambda + d <= 0 and -f_n + h lambda - f_max <= 0 are made of, h = -S_1, S_2.
 
     cone, bound: (n_e, n, *lanes) and (n, *lanes), of the rows' values.
-    cone_reach, bound_reach: the same, of h.
-    friction: (n, *lanes).
+    cone_reach, bound_reach: of h, in the same shapes.
+    friction: (n, *lanes), of mu in C.
     columns: (6, 3, n, *lanes), of the blocks of G, moments as in `Grasps`.
     wrench: (6, *lanes), of b.
     weights: (n, 3, 3, *lanes), of Q_0; None where there is none.
@@ -54,15 +75,15 @@ class RowWeights(NamedTuple):
 
 
 def envelope_adjoint(cone_edges: int, with_terms: bool, grasps: Grasps, point: Point, cotangents: tuple) -> Grasps:
-    """The gradient of (21)'s Lagrangian with respect to the data, times a cotangent (*lanes)."""
+    """Find the gradient of (21)'s Lagrangian with respect to the data, times the cotangent (*lanes) of the margin."""
     weight = jnp.where(point.usable, cotangents[0], 0)
     if grasps.actuated is not None:
         return _lagrangian_gradient(cone_edges, grasps, point, weight)
-    clean = lambda x: jnp.where(point.usable, x, 0)
-    force, z_cone = clean(jnp.moveaxis(point.forces, 1, 0)), clean(jnp.moveaxis(point.cone_multipliers, 1, 0))
-    z_cone, z_bound = -z_cone * weight * grasps.present, -clean(point.bound_multipliers) * weight * grasps.present
-    y = clean(point.wrench_multipliers) * weight
-    margin = clean(point.margin)
+    usable = lambda x: jnp.where(point.usable, x, 0)
+    force, z_cone = usable(jnp.moveaxis(point.forces, 1, 0)), usable(jnp.moveaxis(point.cone_multipliers, 1, 0))
+    z_cone, z_bound = -z_cone * weight * grasps.present, -usable(point.bound_multipliers) * weight * grasps.present
+    y = usable(point.wrench_multipliers) * weight
+    margin = usable(point.margin)
     normal = literal(pyramid_facets(cone_edges)[:, 2], force.dtype)[:, None, None]
     rows = RowWeights(
         cone=z_cone,
@@ -77,8 +98,8 @@ def envelope_adjoint(cone_edges: int, with_terms: bool, grasps: Grasps, point: P
 
 
 def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, with_terms: bool) -> Grasps:
-    """Cotangents of the data, from those of the rows."""
-    zero = jax.tree.map(_nothing, grasps)
+    """Turn cotangents of the rows into those of the data."""
+    zero = jax.tree.map(_zero_cotangent, grasps)
     columns, friction, inverse_root, terms = reach_adjoint(
         grasps, rows.cone_reach, rows.bound_reach, cone_edges, with_terms
     )
@@ -101,7 +122,7 @@ def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, with_terms: bo
     )
 
 
-def _nothing(x: jax.Array) -> jax.Array | np.ndarray:
+def _zero_cotangent(x: jax.Array) -> jax.Array | np.ndarray:
     return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
 
 
@@ -140,58 +161,52 @@ def is_compact(along: Along) -> bool:
     return along.arguments.data.actuation is None and not set_changes(along)
 
 
+class _Units(NamedTuple):
+    """Units of the solver in newtons: of forces (3, n, *lanes), of rows (n_e + 1, n, *lanes), of the objective."""
+
+    forces: jax.Array
+    rows: jax.Array
+    objective: jax.Array
+
+
 def _central_adjoint(
     objective: Objective, cone_edges: int, with_terms: bool, grasps: Grasps, point: Point, cotangents: Point
 ) -> Grasps:
-    """From cotangents of a central point to those of the data: one solve with the symmetric matrix."""
+    """Turn cotangents of a central point into those of the data, by one solve with the symmetric matrix."""
     if grasps.actuated is not None:
         return _actuated_adjoint(objective, cone_edges, grasps, point, cotangents)
     program = scale_program(grasps, cone_edges)
     problem, unit = objective.problem(grasps, program)
-    (group,), kappa = problem.groups, central_kappa(objective, grasps, unit)
-    iterate = iterate_of(problem, program, point, unit, kappa)
-    (z,), (s,) = iterate.z, iterate.s
+    iterate = iterate_of(problem, program, point, unit, central_kappa(objective, grasps, unit))
+    where_usable = lambda x: None if x is None else jnp.where(point.usable, x, 0)
     forces = jnp.where(point.usable, point.forces, 0)
     scales = jnp.stack([program.tangential, program.tangential, program.normal])
-    row_units = program.row_units()
-    given = lambda ct: None if ct is None else jnp.where(point.usable, ct, 0)
-    ct = cotangents._replace(**{name: given(part) for name, part in cotangents._asdict().items()})
+    units = _Units(scales, program.row_units(), unit)
+    ct = cotangents._replace(**{name: where_usable(part) for name, part in cotangents._asdict().items()})
 
-    pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
-    effort_weights = None
-    if ct.effort is not None:
-        pull = pull + ct.effort * weighed(forces, grasps.options.effort_weights)
-        effort_weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
-    right_x = jnp.moveaxis(pull, 1, 0) * scales * grasps.present
-    cone = jnp.zeros_like(z[:-1]) if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)
-    bound = jnp.zeros_like(z[-1]) if ct.bound_multipliers is None else ct.bound_multipliers
-    right_z = jnp.concatenate([cone, bound[None]]) * unit / row_units * grasps.present
-    right_y, right_lambda = jnp.zeros_like(problem.rhs), None
-    if ct.wrench_multipliers is not None:
-        right_y = program.wrench_multipliers_adjoint(ct.wrench_multipliers, grasps.units) * unit
-    if problem.bordered:
-        right_lambda = jnp.zeros_like(unit) if ct.margin is None else ct.margin * program.scale
-    right = ((right_x,), right_lambda, right_y, (right_z,))
-    (move_x,), move_lambda, move_y, (values,) = solve_symmetric(problem, (s,), (z,), right)
+    # K m = c.
+    right, weights = _right_side(problem, program, grasps, forces, ct, units)
+    (move_x,), move_lambda, move_y, (move_z,) = solve_symmetric(problem, iterate.s, iterate.z, right)
 
-    # Back in newtons: forces, margin, and multipliers for an objective in the solver's unit.
-    values = -values * grasps.present / row_units
-    z = z / row_units
+    # -m'dF: m and the point back in newtons, multipliers for an objective in the solver's unit.
+    values = -move_z * grasps.present / units.rows
+    z = iterate.z[0] / units.rows
     margin = jnp.where(point.usable, point.margin, 0)
     reach = values * margin
     if move_lambda is not None:
         reach = reach - z * (move_lambda * program.scale)
-    force, move = jnp.moveaxis(forces, 1, 0), move_x * scales
+    force, move = jnp.moveaxis(forces, 1, 0), move_x * units.forces
     y = jnp.where(point.usable, point.wrench_multipliers, 0) / grasps.units / unit
     move_y = program.wrench_multipliers(move_y, jnp.ones_like(grasps.units))
     normal = literal(pyramid_facets(cone_edges)[:, 2], z.dtype)[:, None, None]
     asked = None
     if isinstance(objective, LeastEffort):
-        asked = total(values * group.sigma * row_units) / program.scale
+        # lambda is data, and H = Q_0 / unit in the stationarity of f.
+        asked = total(values * problem.groups[0].sigma * units.rows) / program.scale
         asked = asked if ct.margin is None else asked + ct.margin
         bend = -0.5 / unit * (force[:, None] * move + move[:, None] * force)
         bend = jnp.moveaxis(bend, 2, 0)
-        effort_weights = bend if effort_weights is None else bend + effort_weights
+        weights = bend if weights is None else bend + weights
     rows = RowWeights(
         cone=values[:-1],
         bound=values[-1],
@@ -200,14 +215,37 @@ def _central_adjoint(
         friction=fold(jnp.add, normal * (values[:-1] * force[2] - z[:-1] * move[2])),
         columns=-(y[:, None, None] * move + move_y[:, None, None] * force),
         wrench=move_y,
-        weights=None if grasps.options.effort_weights is None else effort_weights,
+        weights=None if grasps.options.effort_weights is None else weights,
         margin=asked,
     )
     return _to_grasps(grasps, rows, cone_edges, with_terms)
 
 
+def _right_side(
+    problem: BlockProblem, program: ScaledProgram, grasps: Grasps, forces: jax.Array, ct: Point, units: _Units
+) -> tuple[tuple, jax.Array | None]:
+    """The cotangent c of the scaled (x, lambda, y, z), and what the effort's asks of Q_0 itself, (n, 3, 3, *lanes)."""
+    (group,) = problem.groups
+    pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
+    weights = None
+    if ct.effort is not None:
+        pull = pull + ct.effort * weighed(forces, grasps.options.effort_weights)
+        weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
+    right_x = jnp.moveaxis(pull, 1, 0) * units.forces * grasps.present
+    none = jnp.zeros_like(group.h)
+    cone = none[:-1] if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)
+    bound = none[-1] if ct.bound_multipliers is None else ct.bound_multipliers
+    right_z = jnp.concatenate([cone, bound[None]]) * units.objective / units.rows * grasps.present
+    right_y, right_lambda = jnp.zeros_like(problem.rhs), None
+    if ct.wrench_multipliers is not None:
+        right_y = program.wrench_multipliers_adjoint(ct.wrench_multipliers, grasps.units) * units.objective
+    if problem.bordered:
+        right_lambda = jnp.zeros_like(units.objective) if ct.margin is None else ct.margin * program.scale
+    return ((right_x,), right_lambda, right_y, (right_z,)), weights
+
+
 def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: jax.Array) -> Grasps:
-    """`envelope_adjoint` for a hand, through the scaled program by JAX's own hand."""
+    """`envelope_adjoint` for a hand with actuators: JAX differentiates the Lagrangian of the scaled program."""
     program = scale_program(grasps, cone_edges)
     objective = LargestMargin()
     problem, unit = objective.problem(grasps, program)
@@ -223,7 +261,7 @@ def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: 
 
 
 def _actuated_adjoint(objective: Objective, cone_edges: int, grasps: Grasps, point: Point, cotangents: Point) -> Grasps:
-    """`_central_adjoint` for a hand, through the scaled program by JAX's own hand."""
+    """`_central_adjoint` for a hand with actuators: JAX differentiates m'F of the scaled program."""
     program = scale_program(grasps, cone_edges)
     problem, unit = objective.problem(grasps, program)
     iterate = iterate_of(problem, program, point, unit, central_kappa(objective, grasps, unit))
@@ -233,19 +271,19 @@ def _actuated_adjoint(objective: Objective, cone_edges: int, grasps: Grasps, poi
         return moved._replace(usable=None)
 
     out, pull = jax.vjp(read, grasps, iterate)
-    given = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)
-    known = {name: given(getattr(cotangents, name), like) for name, like in out._asdict().items() if like is not None}
-    direct, back = pull(out._replace(**known))
+    usable = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)
+    ct = {name: usable(getattr(cotangents, name), like) for name, like in out._asdict().items() if like is not None}
+    direct, back = pull(out._replace(**ct))
     right_x, right_lambda = back.x if problem.bordered else (back.x, None)
     move_x, move_lambda, move_y, move_z = solve_symmetric(
         problem, iterate.s, iterate.z, (right_x, right_lambda, back.y, back.z)
     )
     moves = ((move_x, move_lambda) if problem.bordered else move_x, move_y, move_z)
 
-    def lack(grasps: Grasps) -> jax.Array:
+    def along_moves(grasps: Grasps) -> jax.Array:
         residuals = objective.problem(grasps, scale_program(grasps, cone_edges))[0].residuals(iterate)
         terms = jax.tree.map(jnp.multiply, moves, (residuals.dual, residuals.primal, residuals.rows))
         return -jnp.sum(jnp.where(point.usable, reduce_rows(jnp.add, terms, unit.ndim), 0))
 
-    indirect = jax.grad(lack, allow_int=True)(grasps)
+    indirect = jax.grad(along_moves, allow_int=True)(grasps)
     return jax.tree.map(lambda a, b: a if a.dtype == jax.dtypes.float0 else a + b, direct, indirect)
