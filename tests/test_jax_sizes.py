@@ -26,7 +26,7 @@ def no_size_of_its_own(monkeypatch):
 
 def known_size(contacts, disturbances=PUSHES, margin=None, **given):
     data = GraspData.from_arguments(contacts, disturbances, **given)
-    return sizes.with_a_known_size("a kernel", data, Options(margin=margin))
+    return sizes.fill_to_known_size("a kernel", data, Options(margin=margin))
 
 
 def test_answers_are_those_of_the_batch_itself():

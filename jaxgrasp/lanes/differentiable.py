@@ -1,9 +1,9 @@
-"""Kernels over the lanes of a batch, with derivatives that are kernels, too.
+"""Functions over the lanes of a batch, with derivatives that are such functions, too.
 
-JAX does not look into the stages that compute the values: the solver's loop runs in them. A kernel states its
-derivative itself, as a function of the same arguments; this module runs that function over the lanes.
+JAX does not look into the stages that compute the values: the solver's loop runs in them. So a `BatchedFunction` states
+its derivative itself, as a function of the same arguments; this module runs that function over the lanes.
 
-The arguments of a kernel are a pytree of the caller's. Which leaves all lanes share, and which leaves change, is told
+The arguments are a pytree of the caller's. Which leaves all lanes share, and which leaves change, is told
 by parallel pytrees: with the same structure, and a bool or a change in place of each array.
 """
 
@@ -26,10 +26,10 @@ Tree = Any
 
 @dataclass(frozen=True)
 class Lanes:
-    """How the arguments of a kernel lie: leaves (lanes, ...), or without the leading axis where shared."""
+    """How the arguments of a batched function lie: leaves (lanes, ...), or without the leading axis where shared."""
 
     admit: Callable[[Tree], Any]
-    """Turns the arguments, lanes last, into what the kernels take: a function of a module, so that its name tells which
+    """Turns the arguments, lanes last, into what the stages take: a function of a module, so that its name tells which
     one it is."""
     shared: Tree
     """Whether all lanes share a leaf, a bool for each, parallel to the arguments."""
@@ -41,25 +41,22 @@ class Lanes:
     """The number of lanes of a tile that cannot be one function."""
 
 
-class Kernel(Protocol):
-    """What is computed for every lane, and how it varies with the arguments."""
+class BatchedFunction(Protocol):
+    """A function that is computed for every lane, and how its results vary with the arguments."""
 
     @property
     def rows(self) -> int:
-        """How many rows a contact has but for the bound on its force, which sets the size of a tile."""
+        """The number of rows of a contact without the bound on its force, which sets the size of a tile."""
         ...
 
     @property
     def tile(self) -> int | None:
-        """None where it is free of library calls and large reductions, else how many lanes to work on.
-
-        See `map_lanes`.
-        """
+        """The number of lanes of a tile; None for a function without library calls and large reductions."""
         ...
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
-        """See `map_lanes`; the first takes (admitted arguments, held)."""
+        """The parts that run one after another, see `map_lanes`; the first takes (admitted arguments, held)."""
         ...
 
     def tangents(self, along: "Along", out: Tree, /) -> Tree:
@@ -69,25 +66,25 @@ class Kernel(Protocol):
 
 @dataclass(frozen=True)
 class OfPyramids:
-    """A kernel with the rows of friction pyramids."""
+    """A batched function with the rows of friction pyramids."""
 
     cone_edges: int
     tile = None
 
     @property
     def rows(self) -> int:
-        """See `Kernel`; for fewer than eight edges, tiles are large enough."""
+        """n_e, the number of rows of a contact; for fewer than eight, tiles are large enough."""
         return max(8, self.cone_edges)
 
 
 class Plain(ABC):
-    """A kernel of one stage that is its own derivative's function."""
+    """A batched function of one stage, which JAX differentiates."""
 
     tile = None
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
-        """See `Kernel`."""
+        """`evaluate` alone."""
         return (lambda admitted, _: self.evaluate(admitted),)
 
     @abstractmethod
@@ -95,7 +92,7 @@ class Plain(ABC):
         """The results, lanes last."""
 
     def tangents(self, along: "Along", out: Tree) -> Tree:
-        """See `Kernel`."""
+        """The derivative of `evaluate`."""
         return along.function(self.evaluate, out)
 
 
@@ -114,7 +111,7 @@ class Along:
         """The derivative of `function(admitted arguments)`, lanes last, as JAX finds it."""
 
         def kernel(arguments: Tree, changes: Tree) -> Tree:
-            at, start = self._admitted(arguments, changes)
+            at, start = self._admit_changed(arguments, changes)
             return jax.jvp(lambda varied: function(at(varied)), (start,), (changes,))[1]
 
         return linear_lanes(kernel, self.arguments, self.changes, self.lanes.shared, like)
@@ -134,7 +131,7 @@ class Along:
             arguments, held = data
             lanes = jax.tree.leaves(cotangents)[0].shape[-1]
             spread = lambda _, x: jnp.broadcast_to(x, (*x.shape[:-1], lanes))
-            at, start = self._admitted(arguments, _where_changed(spread, self.changes, arguments))
+            at, start = self._admit_changed(arguments, _where_changed(spread, self.changes, arguments))
             admitted, pull = jax.vjp(at, start)
             return pull(adjoint(admitted, held, cotangents))[0]
 
@@ -142,11 +139,11 @@ class Along:
         rows = self.lanes.rows if self.lanes.compact and compact else 0
         return transposed_lanes(back, (self.arguments, held), self.changes, shared, like, rows)
 
-    def value(self, kernel: Kernel, held: Tree) -> Tree:
-        """Another kernel over the same arguments."""
-        return differentiable(kernel, self.lanes, self.arguments, held)
+    def value(self, function: BatchedFunction, held: Tree) -> Tree:
+        """The value of another batched function of the same arguments."""
+        return differentiable(function, self.lanes, self.arguments, held)
 
-    def _admitted(self, arguments: Tree, changes: Tree) -> tuple[Callable[[Tree], Any], Tree]:
+    def _admit_changed(self, arguments: Tree, changes: Tree) -> tuple[Callable[[Tree], Any], Tree]:
         """The admitted arguments as a function of those that change, and these."""
         start = _where_changed(lambda change, x: jnp.broadcast_to(x, change.shape), changes, arguments)
         instead = lambda new, x: x if new is None else new
@@ -163,26 +160,26 @@ def _is_none(x: Any) -> bool:
     return x is None
 
 
-def differentiable(kernel: Kernel, lanes: Lanes, arguments: Tree, held: Tree = ()) -> Tree:
-    """Run a kernel over lanes; its derivatives with respect to the arguments, of any order, are its `tangents`.
+def differentiable(function: BatchedFunction, lanes: Lanes, arguments: Tree, held: Tree = ()) -> Tree:
+    """Run a batched function over lanes; its derivatives with respect to the arguments, of any order, are `tangents`.
 
     Args:
-        kernel: what to run.
+        function: what to run.
         lanes: how the arguments lie.
         arguments: a pytree of arrays, leaves (lanes, ...), or without the leading axis where shared.
-        held: what else the kernel is given, leaves (lanes, ...); constants to the derivative.
+        held: what else the function is given, leaves (lanes, ...); constants to the derivative.
     """
 
     @jax.custom_jvp
     def value(arguments: Tree, held: Tree) -> Tree:
         def enter(inputs: tuple[Tree, Tree]) -> Tree:
-            return kernel.stages[0](lanes.admit(inputs[0]), inputs[1])
+            return function.stages[0](lanes.admit(inputs[0]), inputs[1])
 
         shared = (lanes.shared, jax.tree.map(lambda _: False, held))
-        stages = (enter, *kernel.stages[1:])
-        # Kernels have no state but their fields, which are numbers, names and types.
-        name = lambda function: f"{function.__module__}.{function.__qualname__}"
-        known_as = f"{name(type(kernel))} {vars(kernel)} {name(lanes.admit)}"
+        stages = (enter, *function.stages[1:])
+        # Batched functions have no state but their fields, which are numbers, names and types.
+        name = lambda x: f"{x.__module__}.{x.__qualname__}"
+        known_as = f"{name(type(function))} {vars(function)} {name(lanes.admit)}"
         return map_lanes(
             stages,
             (arguments, held),
@@ -208,7 +205,7 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Tree, held: Tree = (
         changes = jax.tree.map(change_of, dots[0], lanes.shared)
         if not jax.tree.leaves(changes):
             return out, jax.tree.map(partial(zero_from_primal, symbolic_zeros=True), out)
-        tangents = kernel.tangents(Along(lanes, arguments, changes), out)
+        tangents = function.tangents(Along(lanes, arguments, changes), out)
         still = lambda x, dot: zero_from_primal(x, symbolic_zeros=True) if dot is None else dot
         return out, jax.tree.map(still, out, tangents, is_leaf=_is_none)
 

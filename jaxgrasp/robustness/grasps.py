@@ -17,13 +17,13 @@ from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.kernels import usable
-from jaxgrasp.lanes.differentiable import Kernel, Lanes, differentiable
+from jaxgrasp.lanes.differentiable import BatchedFunction, Lanes, differentiable
 from jaxgrasp.lanes.direct import cut
 from jaxgrasp.lanes.tiles import LOOSE_TILE, TILE
 from jaxgrasp.robustness.actuators import Actuated, clip_limits, stack_rows
 from jaxgrasp.robustness.auditing import audited
-from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs, Options, laid_out
-from jaxgrasp.robustness.interface.sizes import with_a_known_size
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs, Options, lay_out
+from jaxgrasp.robustness.interface.sizes import fill_to_known_size
 
 
 @jax.tree_util.register_dataclass
@@ -75,13 +75,13 @@ class Grasps:
         return stack_rows(self.columns, self.actuated)
 
 
-def over_grasps(kernel: Kernel, data: GraspData, options: Options | None = None) -> Any:
-    """Check shapes, run a kernel over all grasps of a batch, audit its results and give them the batch's shape.
+def over_grasps(function: BatchedFunction, data: GraspData, options: Options | None = None) -> Any:
+    """Check shapes, run a function over all grasps of a batch, audit its results and give them the batch's shape.
 
-    The kernel takes `Grasps`. It is compiled once for its value and for the shapes, which `sizes` keeps few.
+    The function takes `Grasps`. It is compiled once for its value and for the shapes, which `sizes` keeps few.
 
     Args:
-        kernel: what to run; kernels compare by value.
+        function: what to run; it compares by value.
         data: the grasps.
         options: what is asked for; None is nothing beyond the grasps.
 
@@ -89,31 +89,31 @@ def over_grasps(kernel: Kernel, data: GraspData, options: Options | None = None)
         ValueError: shapes that do not fit.
     """
     options = options or Options()
-    fill = with_a_known_size(kernel, data, options)
+    fill = fill_to_known_size(function, data, options)
     if fill is None:
-        return audited(kernel, _run(kernel, data, options), data, options)
-    out = _run(kernel, fill.data, fill.options)
-    return cut(audited(kernel, out, fill.data, fill.options, fill.count), fill.count)
+        return audited(function, _run(function, data, options), data, options)
+    out = _run(function, fill.data, fill.options)
+    return cut(audited(function, out, fill.data, fill.options, fill.count), fill.count)
 
 
 @functools.partial(compiled, static_argnums=(0,), pace=lambda *_: "brief" if usable() else "fast")
-def _run(kernel: Kernel, data: GraspData, options: Options) -> Any:
-    """Run the kernel over the lanes."""
-    arguments = laid_out(data, options)
+def _run(function: BatchedFunction, data: GraspData, options: Options) -> Any:
+    """Run the function over the lanes."""
+    arguments = lay_out(data, options)
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = kernel.tile is None and data.compliance is None and options.effort_weights is None
+    compact = function.tile is None and data.compliance is None and options.effort_weights is None
     n = data.contacts.n_c
-    rows = n * (kernel.rows + 1)
+    rows = n * (function.rows + 1)
     if data.actuation is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.
         joints, actuators = data.actuation.transmission.shape[-2:]
         rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
-    lanes = Lanes(admit, arguments.shared, rows, compact, kernel.tile or LOOSE_TILE)
-    out = differentiable(kernel, lanes, arguments.inputs)
+    lanes = Lanes(admit, arguments.shared, rows, compact, function.tile or LOOSE_TILE)
+    out = differentiable(function, lanes, arguments.inputs)
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), out)
 
 
-def grasps_of(arguments: Arguments) -> Grasps:
+def admit_all(arguments: Arguments) -> Grasps:
     """The grasps of public arguments, outside of any kernel."""
     last = lambda x, shared: x[..., None] if shared else jnp.moveaxis(x, 0, -1)
     return admit(jax.tree.map(last, arguments.inputs, arguments.shared))

@@ -17,7 +17,7 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.robustness.auditing import setting
 from jaxgrasp.robustness.auditing.problem import every, picked
 from jaxgrasp.robustness.auditing.setting import audit
-from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, laid_out
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, lay_out
 
 __all__ = ["Audited", "audit", "audited", "hidden"]
 
@@ -95,7 +95,7 @@ def _verdicts(
     kernel: Any, stride: int, data: GraspData, options: Options, out: Tree, turn: jax.Array
 ) -> tuple[Tree, jax.Array]:
     """What the kernel judges, (*batch), and how many answers failed."""
-    arguments = laid_out(data, options)
+    arguments = lay_out(data, options)
     lead = len(arguments.batch)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), out)
     lanes = jax.tree.leaves(flat)[0].shape[0]

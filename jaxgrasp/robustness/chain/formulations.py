@@ -51,7 +51,7 @@ from jaxgrasp.robustness.chain.verdicts import (
     select_programs,
     solve_program,
 )
-from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
+from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.conic.margin import ConicPoint
@@ -145,7 +145,7 @@ def choose_tile(contacts: Contacts, disturbances: DisturbanceSet) -> int:
 
 @dataclass(frozen=True)
 class Chain(Audited):
-    """The kernel of some formulations; its results are pairs of a solution and a scaled point, by name."""
+    """Some formulations as a batched function; its results are pairs of a solution and a scaled point, by name."""
 
     names: tuple[str, ...]
     cone_edges: int
@@ -154,12 +154,12 @@ class Chain(Audited):
 
     @property
     def rows(self) -> int:
-        """See `Kernel`."""
+        """The number of rows of a contact."""
         return self.cone_edges
 
     @property
     def stages(self) -> tuple:
-        """See `Kernel`."""
+        """Scale the grasps, solve the programs of all formulations, and decide from their outcomes."""
         solved = [name for name in self.names if self._twin(name) == name]
         return (
             lambda grasps, _: self._programs(grasps),
@@ -168,7 +168,7 @@ class Chain(Audited):
         )
 
     def tangents(self, along: Along, out: dict) -> dict:
-        """See `Kernel`."""
+        """The derivative by the envelope theorem."""
         values = {name: (solution.margin, solution.directions) for name, (solution, _) in out.items()}
         changes = along.adjoint(self._adjoint, out, values)
         changed = {}
@@ -183,7 +183,7 @@ class Chain(Audited):
     def judge(self, arguments: Arguments, out: dict, anew: bool) -> dict[str, ChainVerdict]:
         """See `Audited`."""
         problem = problem_of(arguments)
-        basics, scaled = self._scaled(grasps_of(arguments)) if anew else (None, {})
+        basics, scaled = self._scaled(admit_all(arguments)) if anew else (None, {})
         return {
             name: self._judged(name, problem, solution, point, basics, scaled.get(self._twin(name)))
             for name, (solution, point) in out.items()

@@ -28,7 +28,7 @@ from jaxgrasp.robustness.auditing.pyramids import balanced
 from jaxgrasp.robustness.chain.formulations import check_vertices, choose_tile
 from jaxgrasp.robustness.chain.programs import FORMULATIONS, Basics, compute_basics, scale_formulation
 from jaxgrasp.robustness.chain.verdicts import Decision, decide, select_programs, solve_program
-from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
+from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, optional_float
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.arrow import ArrowProblem, patterns_of
@@ -145,7 +145,7 @@ class _TotalEffort(OfPyramids, Audited):
         holds = balanced(problem, solution.forces) & admissible(problem, solution.forces, *check)
         holds &= all_hold(problem, disturbed, wrenches, check) & (solution.lower_bound <= solution.effort)
         if anew:
-            grasps = grasps_of(arguments)
+            grasps = admit_all(arguments)
             last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), record)
             effort, unit = _problem(grasps, compute_basics(grasps, False), self.cone_edges, last.x)
             found = effort.objective(last.x), effort.proven(last)

@@ -156,14 +156,14 @@ def _balance(grasps: Grasps, basics: Basics, rest: jax.Array, forces: jax.Array,
     Directions without a lambda_j above 0 do not count.
     """
     counts = jnp.isfinite(reached) & (reached > 0)
-    wanted = grasps.wrench - jnp.moveaxis(jnp.where(counts, reached, 0) * basics.wrenches, 1, 0)
-    wanted = jnp.concatenate([wanted, grasps.wrench[None]])
+    required = grasps.wrench - jnp.moveaxis(jnp.where(counts, reached, 0) * basics.wrenches, 1, 0)
+    required = jnp.concatenate([required, grasps.wrench[None]])
     counts = jnp.concatenate([counts, jnp.ones_like(counts[:1])])
     supplying = jnp.concatenate([forces, rest[None]])
     supplied = jnp.einsum("eanl,danl->del", grasps.columns, supplying, precision="highest")
     sizes = jnp.sqrt((supplying * supplying).sum(1)).sum(1)
-    sizes = jnp.maximum(sizes, jnp.abs(wanted).max(1))
-    right = jnp.abs(supplied - wanted).max(1) <= _MISSED[forces.dtype.name] * sizes
+    sizes = jnp.maximum(sizes, jnp.abs(required).max(1))
+    right = jnp.abs(supplied - required).max(1) <= _MISSED[forces.dtype.name] * sizes
     return (right | ~counts).all(0)
 
 

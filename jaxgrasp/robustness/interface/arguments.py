@@ -162,7 +162,7 @@ def trailing_shapes(data: GraspData, options: Options) -> tuple[GraspData, Optio
     return shapes, replace(alike(options, ()), effort_weights=alike(options.effort_weights, (n, 3, 3)))
 
 
-def laid_out(data: GraspData, options: Options) -> Arguments:
+def lay_out(data: GraspData, options: Options) -> Arguments:
     """Broadcast all arguments to the batch that they have in common.
 
     Raises:

@@ -34,11 +34,11 @@ class Filled:
     """How many grasps were asked for."""
 
 
-def with_a_known_size(kernel: Hashable, data: GraspData, options: Options) -> Filled | None:
-    """The arguments for a size that has programs; None where they are taken as they are.
+def fill_to_known_size(function: Hashable, data: GraspData, options: Options) -> Filled | None:
+    """Fill the arguments up to a size that has programs; None where they are taken as they are.
 
     Args:
-        kernel: what is to be run; it compares by value.
+        function: what is to be run; it compares by value.
         data: the grasps.
         options: what is asked for.
     """
@@ -52,7 +52,7 @@ def with_a_known_size(kernel: Hashable, data: GraspData, options: Options) -> Fi
     if not is_direct(leaves) or any(x.shape[:1] != (count,) for x in jax.tree.leaves(contacts)):
         return None
     shapes = tuple((x.shape[1:] if x.shape[:1] == (count,) else x.shape, x.dtype) for x in leaves)
-    kind = kernel, structure, shapes
+    kind = function, structure, shapes
     size = _size(kind, count)
     if size == count:
         return None
@@ -76,7 +76,7 @@ def with_a_known_size(kernel: Hashable, data: GraspData, options: Options) -> Fi
 
 
 class _OtherAxes(Exception):
-    """An argument has other axes than those of the batch; `laid_out` tells of what does not fit."""
+    """An argument has other axes than those of the batch; `lay_out` tells of what does not fit."""
 
 
 def _size(kind: Hashable, count: int) -> int:
@@ -87,5 +87,5 @@ def _size(kind: Hashable, count: int) -> int:
 
 
 def _next(count: int) -> int:
-    """The smallest size with programs that is not below the count."""
+    """The smallest size of all batches that is not below the count."""
     return next((size for size in _SMALL if size >= count), power_of_two(count, 1))

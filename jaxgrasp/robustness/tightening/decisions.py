@@ -15,11 +15,11 @@ from jaxgrasp.robustness.tightening.certificates import balance, certify
 from jaxgrasp.robustness.tightening.objectives import (
     LeastEffort,
     Objective,
-    effort_of,
+    compute_effort,
     effort_problem,
     margin_problem,
 )
-from jaxgrasp.robustness.tightening.points import centred
+from jaxgrasp.robustness.tightening.points import find_central_point
 from jaxgrasp.robustness.tightening.program import ScaledProgram, actuated_values
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.kkt import Record, Rows
@@ -27,7 +27,7 @@ from jaxgrasp.solvers.block.margin import MarginProblem
 from jaxgrasp.solvers.interior_point import Iterate, Outcome, Settings
 from jaxgrasp.solvers.status import Status
 
-_SETTINGS = {
+_MARGIN_SETTINGS = {
     "float64": Settings(
         tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=False, safeguard=0.0, patience=8
     ),
@@ -113,7 +113,7 @@ class _Found(NamedTuple):
 def solve_margin(grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Record, Iterate]:
     """Solve (21) for lanes; also the scaled record, from which (22) starts, and the last iterate."""
     problem = margin_problem(program, grasps.options.cutoff)
-    settings = _towards_centre(_SETTINGS[program.rhs.dtype.name], grasps, program, program.scale)
+    settings = _towards_centre(_MARGIN_SETTINGS[program.rhs.dtype.name], grasps, program, program.scale)
     outcome = interior_point.solve(problem, settings, grasps.valid & ~program.wrench_outside)
     found = _assess_margin(grasps, program, problem, outcome, settings.tolerance)
     record = outcome.record._replace(lower=found.low, upper=found.high, x=found.x)
@@ -145,7 +145,7 @@ def solve_margin(grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Reco
         margin=margin,
         upper_bound=upper,
         forces=where_margin(forces),
-        effort=where_margin(effort_of(forces, None)),
+        effort=where_margin(compute_effort(forces, None)),
         status=status,
         iterations=outcome.iterations,
         primal_residual=where_margin(problem.violations(record.x, low)),
@@ -259,7 +259,7 @@ def at_centre(
     possible: jax.Array,
 ) -> Solution:
     """Put the central point in place of the best one; the lane is solved where it is found."""
-    point = centred(objective, grasps, program, iterate, possible)
+    point = find_central_point(objective, grasps, program, iterate, possible)
     margin = jnp.where(program.slippery, jnp.minimum(point.margin, 0), point.margin)
     values = point._replace(margin=margin)._asdict()
     found = values.pop("usable")
@@ -318,7 +318,7 @@ def solve_effort(grasps: Grasps, program: ScaledProgram, first: Solution, record
         margin=where_forces(jnp.where(attained > first.upper_bound, first.upper_bound, attained)),
         upper_bound=first.upper_bound,
         forces=where_forces(forces),
-        effort=where_forces(effort_of(forces, grasps.options.effort_weights)),
+        effort=where_forces(compute_effort(forces, grasps.options.effort_weights)),
         status=status,
         iterations=first.iterations + outcome.iterations,
         primal_residual=where_forces(missed),

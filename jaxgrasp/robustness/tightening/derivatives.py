@@ -42,8 +42,8 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.lanes.differentiable import Along, OfPyramids
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.objectives import LargestMargin, LeastEffort, Objective, weighed
-from jaxgrasp.robustness.tightening.points import Point, central_kappa, centred, iterate_of, point_of
+from jaxgrasp.robustness.tightening.objectives import LargestMargin, LeastEffort, Objective, apply_weights
+from jaxgrasp.robustness.tightening.points import Point, build_point, central_kappa, find_central_point, scale_point
 from jaxgrasp.robustness.tightening.program import ScaledProgram, prepare, scale_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
 from jaxgrasp.solvers.block.kkt import BlockProblem, total
@@ -128,22 +128,23 @@ def _zero_cotangent(x: jax.Array) -> jax.Array | np.ndarray:
 
 @dataclass(frozen=True)
 class CentralPoint(OfPyramids):
-    """The kernel that finds the central point next to a point of (21) or (22)."""
+    """The function that finds the central point next to a point of (21) or (22)."""
 
     objective: Objective
     """Which of the two programs it is."""
 
     @property
     def stages(self) -> tuple:
-        """See `Kernel`; the point is held."""
-        return (lambda grasps, point: (*prepare(grasps, self.cone_edges), point), lambda given: self._find(*given))
+        """Scale the grasps, then find the point next to the one that is held."""
+        return (lambda grasps, point: (*prepare(grasps, self.cone_edges), point), lambda scaled: self._find(*scaled))
 
     def _find(self, grasps: Grasps, program: ScaledProgram, point: Point) -> Point:
         problem, unit = self.objective.problem(grasps, program)
-        return centred(self.objective, grasps, program, iterate_of(problem, program, point, unit, None), point.usable)
+        start = scale_point(problem, program, point, unit, None)
+        return find_central_point(self.objective, grasps, program, start, point.usable)
 
     def tangents(self, along: Along, out: Point) -> Point:
-        """See `Kernel`."""
+        """The derivative by the implicit function theorem."""
         adjoint = partial(_central_adjoint, self.objective, self.cone_edges, set_changes(along))
         return along.adjoint(adjoint, out, out._replace(usable=None), is_compact(along))
 
@@ -177,7 +178,7 @@ def _central_adjoint(
         return _actuated_adjoint(objective, cone_edges, grasps, point, cotangents)
     program = scale_program(grasps, cone_edges)
     problem, unit = objective.problem(grasps, program)
-    iterate = iterate_of(problem, program, point, unit, central_kappa(objective, grasps, unit))
+    iterate = scale_point(problem, program, point, unit, central_kappa(objective, grasps, unit))
     where_usable = lambda x: None if x is None else jnp.where(point.usable, x, 0)
     forces = jnp.where(point.usable, point.forces, 0)
     scales = jnp.stack([program.tangential, program.tangential, program.normal])
@@ -229,7 +230,7 @@ def _right_side(
     pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
     weights = None
     if ct.effort is not None:
-        pull = pull + ct.effort * weighed(forces, grasps.options.effort_weights)
+        pull = pull + ct.effort * apply_weights(forces, grasps.options.effort_weights)
         weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
     right_x = jnp.moveaxis(pull, 1, 0) * units.forces * grasps.present
     none = jnp.zeros_like(group.h)
@@ -249,7 +250,7 @@ def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: 
     program = scale_program(grasps, cone_edges)
     objective = LargestMargin()
     problem, unit = objective.problem(grasps, program)
-    iterate = iterate_of(problem, program, point, unit, None)
+    iterate = scale_point(problem, program, point, unit, None)
 
     def value(grasps: Grasps) -> jax.Array:
         moved = objective.problem(grasps, scale_program(grasps, cone_edges))[0]
@@ -264,10 +265,10 @@ def _actuated_adjoint(objective: Objective, cone_edges: int, grasps: Grasps, poi
     """`_central_adjoint` for a hand with actuators: JAX differentiates m'F of the scaled program."""
     program = scale_program(grasps, cone_edges)
     problem, unit = objective.problem(grasps, program)
-    iterate = iterate_of(problem, program, point, unit, central_kappa(objective, grasps, unit))
+    iterate = scale_point(problem, program, point, unit, central_kappa(objective, grasps, unit))
 
     def read(grasps: Grasps, iterate: Iterate) -> Point:
-        moved = point_of(objective, grasps, scale_program(grasps, cone_edges), iterate, unit, point.usable)
+        moved = build_point(objective, grasps, scale_program(grasps, cone_edges), iterate, unit, point.usable)
         return moved._replace(usable=None)
 
     out, pull = jax.vjp(read, grasps, iterate)

@@ -18,7 +18,7 @@ from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.decisions import solve_effort, solve_margin
-from jaxgrasp.robustness.tightening.kernel import Tightening, changed
+from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
 from jaxgrasp.robustness.tightening.objectives import LeastEffort
 from jaxgrasp.robustness.tightening.program import ScaledProgram
 
@@ -89,4 +89,4 @@ class _LeastEffort(Tightening):
 
     def tangents(self, along: Along, found: tuple) -> tuple:
         out = found[0]
-        return changed(found, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)
+        return change_of_results(found, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)

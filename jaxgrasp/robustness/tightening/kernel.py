@@ -1,4 +1,4 @@
-"""The common part of the batched programs (21) and (22): what they hand out, its audit and its derivatives."""
+"""The common part of the batched programs (21) and (22): their results, the audit of these and their derivatives."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
@@ -24,19 +24,19 @@ from jaxgrasp.solvers.status import Status
 
 @dataclass(frozen=True)
 class Tightening(OfPyramids, Audited, ABC):
-    """The common part of the kernels of (21) and (22), whose results are a solution and evidence for its audit."""
+    """The common part of (21) and (22) as batched functions; their results are a solution and evidence for an audit."""
 
     objective: ClassVar[Objective]
     """Which of the two programs this is."""
     smooth: bool
     """Whether the central point is asked for in place of the optimum."""
     evident: bool = True
-    """Whether the kernel writes evidence; without an audit nobody reads it."""
+    """Whether evidence is part of the results; without an audit nobody reads it."""
 
     @property
     def stages(self) -> tuple:
         """Scale the grasps, then solve them."""
-        return (lambda grasps, _: prepare(grasps, self.cone_edges), lambda given: self._solve(*given))
+        return (lambda grasps, _: prepare(grasps, self.cone_edges), lambda scaled: self._solve(*scaled))
 
     @abstractmethod
     def _solve(self, grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Evidence | None]: ...
@@ -68,8 +68,8 @@ class Tightening(OfPyramids, Audited, ABC):
         return kernel.tangents(along, point if self.smooth else along.value(kernel, point))
 
 
-def changed(found: tuple[Solution, Evidence | None], change: Point, upper_bound: jax.Array | None) -> tuple:
-    """A change of the results; None for what does not vary, or counts as if it did not."""
+def change_of_results(found: tuple[Solution, Evidence | None], change: Point, upper_bound: jax.Array | None) -> tuple:
+    """The change of the results; None for fields that do not vary, or count as if they did not."""
     varying = change._asdict() | {"upper_bound": upper_bound}
     still = jax.tree.map(lambda _: None, found[1])
     changes: dict[str, Tree] = {f.name: varying.get(f.name) for f in fields(Solution)}

@@ -18,7 +18,7 @@ from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.decisions import at_centre, solve_margin
 from jaxgrasp.robustness.tightening.derivatives import envelope_adjoint, is_compact, set_changes
-from jaxgrasp.robustness.tightening.kernel import Tightening, changed
+from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
 from jaxgrasp.robustness.tightening.objectives import LargestMargin
 from jaxgrasp.robustness.tightening.program import ScaledProgram
 from jaxgrasp.solvers.status import Status
@@ -102,4 +102,4 @@ class _LargestDisturbance(Tightening):
             adjoint = partial(envelope_adjoint, self.cone_edges, set_changes(along))
             compact = is_compact(along)
             change = change._replace(margin=along.adjoint(adjoint, point, (out.margin,), compact)[0])
-        return changed(found, change, change.margin)
+        return change_of_results(found, change, change.margin)

@@ -19,38 +19,44 @@ _REFINEMENTS = {"float64": 0, "float32": 1}
 
 
 def margin_problem(program: ScaledProgram, cutoff: jax.Array | None = None) -> MarginProblem:
-    """(21); a margin below the cutoff, in units of the disturbances, is of no interest."""
+    """(21) as a problem for the solver; it gives up margins below the cutoff, in units of the disturbances."""
     refinements = _REFINEMENTS[program.rhs.dtype.name]
     cutoff = None if cutoff is None else cutoff / program.scale
     return MarginProblem(program.groups, program.rhs, program.dropped, program.radius, refinements, cutoff)
 
 
-class Effort(NamedTuple):
-    """(22): the problem (without a guess), the scaled margin that is asked for, and sqrt of the unit of effort."""
+class ScaledEffort(NamedTuple):
+    """(22) as a problem for the solver."""
 
     problem: EffortProblem
-    wanted: jax.Array
+    """The problem, without a guess where to start."""
+    margin: jax.Array
+    """The margin that is asked for, scaled, (*lanes)."""
     unit: jax.Array
+    """The root of the unit of effort, (*lanes)."""
 
 
-def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> Effort:
-    """(22)."""
+def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> ScaledEffort:
+    """(22) as a problem for the solver, which starts from the guess."""
     blocks, *others = program.groups
     dtype, asked = program.rhs.dtype, grasps.options.margin
     assert asked is not None
-    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, asked / program.scale)
+    margin = jnp.where(program.disturbance_outside | program.slippery, 0, asked / program.scale)
     eye = jnp.eye(3, dtype=dtype)[..., None, None]
-    # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
+    # H = D Q_0 D = root'root with root = R D, Q_0 = R'R and the units D of forces.
     root = eye if grasps.weight_roots is None else grasps.weight_roots
     root = root * jnp.stack([program.tangential, program.tangential, program.normal]) * blocks.present
     largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
     largest = jnp.where(largest > 0, largest, 1)
 
-    def held(group: Blocks, hessian: jax.Array) -> Blocks:
-        return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * wanted, hessian=hessian)
+    def with_margin(group: Blocks, hessian: jax.Array) -> Blocks:
+        return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * margin, hessian=hessian)
 
-    # The actuators' efforts cost nothing.
-    groups = (held(blocks, root / largest), *[held(g, jnp.zeros_like(g.present)[None, None]) for g in others])
+    # Actuator efforts cost nothing.
+    groups = (
+        with_margin(blocks, root / largest),
+        *[with_margin(g, jnp.zeros_like(g.present)[None, None]) for g in others],
+    )
     problem = EffortProblem(
         groups,
         program.rhs,
@@ -60,24 +66,24 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
         guess,
         tuple(least_curvature(g.root) for g in groups),
     )
-    return Effort(problem, wanted, largest)
+    return ScaledEffort(problem, margin, largest)
 
 
-def weighed(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """Q_0 f of forces (n, 3, *lanes); weights None for Q_0 = I."""
+def apply_weights(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
+    """Q_0 f of forces (n, 3, *lanes); None for the weights is Q_0 = I."""
     return forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
 
 
-def effort_of(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
+def compute_effort(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
     """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
-    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed(forces, weights)))
+    return 0.5 * fold(jnp.add, fold(jnp.add, forces * apply_weights(forces, weights)))
 
 
 class Objective(ABC):
-    """What is optimised."""
+    """The objective of one of the two programs."""
 
     kappa: ClassVar[dict[str, float]]
-    """kappa of the central points whose derivatives stand for those of exact forces, in the solver's units."""
+    """The kappa of the central points whose derivatives stand for those of exact forces, in the solver's units."""
 
     @abstractmethod
     def problem(self, grasps: Grasps, program: ScaledProgram) -> tuple[BlockProblem, jax.Array]:
@@ -100,7 +106,7 @@ class LargestMargin(Objective):
         return margin_problem(program), program.scale
 
     def forces_and_margin(self, x: Any, grasps: Grasps, program: ScaledProgram) -> tuple[Rows, jax.Array]:
-        """Lambda is an unknown."""
+        """The margin is an unknown."""
         blocks, margin = x
         return blocks, margin * program.scale
 
@@ -117,6 +123,6 @@ class LeastEffort(Objective):
         return effort.problem, effort.unit**2
 
     def forces_and_margin(self, x: Any, grasps: Grasps, program: ScaledProgram) -> tuple[Rows, jax.Array]:
-        """Lambda is given."""
+        """The margin is given."""
         assert grasps.options.margin is not None
         return x, grasps.options.margin
