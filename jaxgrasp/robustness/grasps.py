@@ -65,9 +65,9 @@ class Grasps:
     weight_roots: jax.Array | None
     """(3, 3, n, *lanes), R with R'R = Q_0; None for Q_0 = I."""
     options: Options
-    """What the caller asks for, lanes trailing, made safe as well."""
+    """The options of the call, lanes trailing, made safe as well."""
     actuated: Actuated | None
-    """What the hand's actuators can do; None where the fingers can push at will."""
+    """The hand's actuators; None where the fingers can push at will."""
 
     @property
     def rows(self) -> jax.Array:
@@ -173,7 +173,7 @@ def admit(inputs: Inputs) -> Grasps:
 
 
 def _usable_contacts(contacts: Contacts) -> jax.Array:
-    """Whether every contact that is there has data that can be, (*lanes)."""
+    """Whether the data of every contact that is there are admissible, (*lanes)."""
     usable = jnp.isfinite(contacts.positions).all(1) & rotations(contacts.frames)
     usable &= (contacts.friction >= 0) & jnp.isfinite(contacts.friction)
     usable &= (contacts.max_force > 0) & jnp.isfinite(contacts.max_force)
@@ -220,15 +220,15 @@ def _admit_options(options: Options, valid: jax.Array) -> tuple[Options, jax.Arr
     return replace(options, margin=margin, smoothing=smoothing), valid
 
 
-def _lined(positions: jax.Array, there: jax.Array) -> jax.Array:
-    """Whether the points (3, n, *lanes) that are there lie on one line.
+def _lined(positions: jax.Array, present: jax.Array) -> jax.Array:
+    """Whether the points (3, n, *lanes) that are present lie on one line, (*lanes).
 
     Products are compared, not subtracted: a difference of products may be rounded once or twice, as compilers like.
     """
     first, far = positions[:, 0], jnp.zeros_like(positions[:, 0])
     for i in range(1, positions.shape[1]):
-        first = jnp.where(there[:i].any(0), first, positions[:, i])
-    apart = jnp.where(there, positions - first[:, None], 0)
+        first = jnp.where(present[:i].any(0), first, positions[:, i])
+    apart = jnp.where(present, positions - first[:, None], 0)
     for i in range(positions.shape[1]):
         further = fold(jnp.maximum, jnp.abs(apart[:, i])) > fold(jnp.maximum, jnp.abs(far))
         far = jnp.where(further, apart[:, i], far)
@@ -237,14 +237,14 @@ def _lined(positions: jax.Array, there: jax.Array) -> jax.Array:
 
 
 def _length(
-    positions: jax.Array, there: jax.Array, wrench: jax.Array, extents: tuple[jax.Array, ...]
+    positions: jax.Array, present: jax.Array, wrench: jax.Array, extents: tuple[jax.Array, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """The root-mean-square distance of contacts (n, 3, *lanes), 1 where zero, and whether moments can be told in it."""
-    own = lax.stop_gradient(jnp.where(there, jnp.moveaxis(positions, 1, 0), 0))
+    """The root-mean-square distance of contacts (n, 3, *lanes), 1 where zero, and whether it can divide moments."""
+    own = lax.stop_gradient(jnp.where(present, jnp.moveaxis(positions, 1, 0), 0))
     # In units of the largest, whose square may be more, or less, than there are numbers for.
     largest = fold(jnp.maximum, fold(jnp.maximum, jnp.abs(own)))
     largest = jnp.where(largest > 0, largest, 1)
-    count = jnp.maximum(fold(jnp.add, there.astype(own.dtype)), 1)
+    count = jnp.maximum(fold(jnp.add, present.astype(own.dtype)), 1)
     mean = fold(jnp.add, fold(jnp.add, (own / largest) ** 2)) / count
     length = largest * jnp.sqrt(jnp.where(mean > 0, mean, 1))
     usable = jnp.isfinite(length) & jnp.isfinite(1 / length)

@@ -63,7 +63,7 @@ class _WorstCase(OfPyramids, Plain):
 
 
 class RowLosses(NamedTuple):
-    """What the worst unit disturbance takes from every row.
+    """The amount that the worst unit disturbance takes from every row.
 
     cone: (n_e, n, *lanes), -S_1, N.
     bound: (n, *lanes), S_2, N.
@@ -78,7 +78,7 @@ class RowLosses(NamedTuple):
 
 
 def worst_rows(grasps: Grasps, cone_edges: int) -> RowLosses:
-    """What the worst unit disturbance takes from every row."""
+    """Find what the worst unit disturbance takes from every row."""
     inverse, basis = pseudo_inverse(grasps.rows, grasps.inverse_root)
     actuators = None
     if grasps.vertex_inverse_roots is None:

@@ -35,7 +35,7 @@ STEPS = {
 
 @record
 class Binding:
-    """Which constraint decides a margin: the one with the largest multiplier, forces in units of their bounds."""
+    """The constraint that decides a margin: it has the largest multiplier, forces in units of their bounds."""
 
     direction: Int[Array, "*batch"]
     """The disturbance, -1 where the forces at rest decide or there is no answer."""
@@ -60,7 +60,7 @@ class Comparison:
     statuses: dict[str, Int[Array, "*batch"]]
     """`Status`."""
     bindings: dict[str, Binding]
-    """What decides each margin."""
+    """The constraint that decides each margin."""
     gaps: dict[str, Float[Array, "*batch"]]
     """What each step of the chain costs: differences of margins, by the names of `STEPS`. Those with the same cones and
     the same bound are not negative; NaN where one of the two has no answer."""
@@ -158,7 +158,7 @@ class SpecifiedDisturbances:
     changes: Float[Array, "*batch directions contacts 3"]
     """delta f_j, contact frames, N."""
     margin: Float[Array, "*batch"]
-    """What the disturbances could be scaled by; NaN where b alone cannot be borne."""
+    """The factor by which the disturbances could be scaled; NaN where b alone cannot be borne."""
     status: Int[Array, "*batch"]
     """SOLVED where there are such forces, INFEASIBLE where there are none; otherwise as for the margin."""
 

@@ -181,7 +181,7 @@ class Chain(Audited):
         return changed
 
     def judge(self, arguments: Arguments, out: dict, anew: bool) -> dict[str, ChainVerdict]:
-        """See `Audited`."""
+        """Hold every lane against the rules of the audit."""
         problem = problem_of(arguments)
         basics, scaled = self._scaled(admit_all(arguments)) if anew else (None, {})
         return {
@@ -190,11 +190,11 @@ class Chain(Audited):
         }
 
     def spot(self, arguments: Arguments, out: dict) -> dict[str, jax.Array]:
-        """See `Audited`: programs put together anew take as long to compile as they did at first."""
+        """Nothing: programs put together anew take as long to compile as they did at first."""
         return {name: jnp.zeros(solution.margin.shape, bool) for name, (solution, _) in out.items()}
 
     def correct(self, out: dict, verdicts: dict[str, ChainVerdict]) -> dict:
-        """See `Audited`."""
+        """Take back what the audit does not confirm."""
         changed = {}
         for name, (solution, point) in out.items():
             failed, confirmed = verdicts[name]

@@ -53,7 +53,7 @@ FORMULATIONS = {
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class Basics:
-    """What all formulations share; lanes trail."""
+    """The scaled data that all formulations share; lanes trail."""
 
     sizes: jax.Array
     """(3, n, *lanes), the units of forces, N: f = sizes * x."""

@@ -137,7 +137,7 @@ class _TotalEffort(OfPyramids, Audited):
         return TotalEffortSolution(**changes), jax.tree.map(lambda _: None, record)
 
     def judge(self, arguments: Arguments, out: tuple, anew: bool) -> EffortVerdict:
-        """See `Audited`."""
+        """Hold every lane against the rules of the audit."""
         problem, (solution, record) = problem_of(arguments), out
         assert problem.margin is not None
         wrenches = disturbed_wrenches(problem, jnp.broadcast_to(problem.margin[:, None], solution.changes.shape[:2]))
@@ -153,11 +153,11 @@ class _TotalEffort(OfPyramids, Audited):
         return EffortVerdict((solution.status == Status.SOLVED) & ~holds)
 
     def spot(self, arguments: Arguments, out: tuple) -> jax.Array:
-        """See `Audited`: the program put together anew takes as long to compile as it did at first."""
+        """Nothing: the program put together anew takes as long to compile as it did at first."""
         return jnp.zeros(out[0].effort.shape, bool)
 
     def correct(self, out: tuple, verdicts: EffortVerdict) -> tuple:
-        """See `Audited`."""
+        """Take back what the audit does not confirm."""
         solution, record = out
         changed = {
             f.name: hidden(getattr(solution, f.name), verdicts.failed, jnp.nan)

@@ -1,4 +1,4 @@
-"""What callers give: the data of grasps and the options of a call, checked, and laid side by side as lanes.
+"""The data of grasps and the options of a call: checked, and laid side by side as lanes.
 
 `GraspData` says what grasps are, `Options` what a caller asks for. Trees parallel to the two say how a leaf lies: its
 shape without the batch axes, and whether all grasps share it. An option that is a scalar of each grasp needs nothing
@@ -26,7 +26,7 @@ from jaxgrasp.disturbance.vertices import Vertices
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class GraspData:
-    """What grasps are; make one with `from_arguments`."""
+    """The data of a batch of grasps; make one with `from_arguments`."""
 
     contacts: Contacts
     """The contacts; their dtype is the precision of everything."""
@@ -40,7 +40,7 @@ class GraspData:
     cone_margin: Float[Array, "*batch"]
     """d, N: what every facet row keeps in reserve."""
     actuation: Actuation | None
-    """What the hand's actuators can do; None lets every finger push at will."""
+    """The limits and transmission of the hand's actuators; None lets every finger push at will."""
 
     @classmethod
     def from_arguments(
@@ -81,7 +81,7 @@ class GraspData:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What a caller asks for; None where it does not apply."""
+    """The wishes of a caller; None where one does not apply."""
 
     margin: Float[Array, "*batch"] | None = None
     """lambda that (22) is to give, or that (11) is to withstand."""
@@ -101,12 +101,12 @@ def optional_float(name: str, value: ArrayLike | None) -> jax.Array | None:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """What a kernel takes of the public arguments."""
+    """The public arguments as batched functions take them."""
 
     data: GraspData
     """The grasps; the required wrench is always there."""
     options: Options
-    """What is asked for."""
+    """The options of the call."""
     extents: tuple[Float[Array, "*batch 6"], ...]
     """The largest |w_i| of every term of the disturbance set, N and N m; constants to the derivative."""
 
@@ -118,7 +118,7 @@ class Arguments:
     inputs: Inputs
     """Leaves (lanes, ...), or without the leading axis where all grasps share them."""
     shared: Inputs
-    """Whether all grasps share a leaf: a bool for each, parallel to `inputs`."""
+    """A bool for each leaf, parallel to `inputs`: whether all grasps share it."""
     batch: tuple[int, ...]
     """The batch axes that the lanes stand for."""
 
@@ -230,6 +230,7 @@ def _check_vertices(data: GraspData) -> None:
 
 
 def _check_jacobian(data: GraspData) -> None:
+    """Refuse an actuation for another number of contacts."""
     n, actuation = data.contacts.n_c, data.actuation
     if actuation is not None and actuation.jacobian.shape[-3] != n:
         raise ValueError(
@@ -239,7 +240,7 @@ def _check_jacobian(data: GraspData) -> None:
 
 
 def _compliance_shape(data: GraspData) -> Any:
-    """What the shape of Q has to end in, parallel to the compliance: blocks of contacts, or all contacts together.
+    """The shape that Q has to end in, parallel to the compliance: blocks of contacts, or all contacts together.
 
     Raises:
         ValueError: it ends in neither.

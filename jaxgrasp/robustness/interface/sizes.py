@@ -29,9 +29,9 @@ class Filled:
     data: GraspData
     """The grasps, then copies of the last one."""
     options: Options
-    """What is asked for of all of them."""
+    """The options of the grasps and of their copies."""
     count: int
-    """How many grasps were asked for."""
+    """The number of grasps without copies."""
 
 
 def fill_to_known_size(function: Hashable, data: GraspData, options: Options) -> Filled | None:

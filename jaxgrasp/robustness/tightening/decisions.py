@@ -57,7 +57,7 @@ _ACCEPTED_MISS = {"float64": 1e-8, "float32": 1e-5}
 
 
 def evidence(grasps: Grasps, program: ScaledProgram, record: Record) -> Evidence:
-    """What the audit needs beside the answer: the worst rows as they were solved, and what proves (21)'s bound."""
+    """The evidence for the audit: the worst rows as they were solved, and the multipliers that prove (21)'s bound."""
     unit = program.row_units() / program.scale
     cone_and_bound = jnp.where(program.undisturbed, 0, program.sigma * unit)
     effort = None
@@ -87,7 +87,7 @@ class Case(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What is known about (21) when the loop is over; scaled, lanes trail.
+    """The state of (21) when the loop is over; scaled, lanes trail.
 
     low, high: bounds of the margin.
     size: the unit of their gap, the larger of 1 and |low|.

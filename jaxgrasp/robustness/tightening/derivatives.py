@@ -26,8 +26,9 @@ h_i adds m_z r_i + z_i (a_i'm_x + sigma_i m_lambda), the equalities add m_y'(E x
 
 and (22)'s lambda, which is data there, gets -m_z'sigma. `reach_adjoint` takes S_1 and S_2 back to the grasps.
 
-Both are written out for grasps without actuators: free of large reductions and library calls, they can be native
-kernels. With actuators JAX transposes the scaled program itself.
+Without actuators both are written out and can be native kernels. JAX's transpose of the scaled program has operations
+that kernels do not know: with it 16,384 margins and their gradients took 10.4 (float64) and 9.4 (float32) times as
+long. With actuators it is used all the same.
 """
 
 from dataclasses import dataclass, replace

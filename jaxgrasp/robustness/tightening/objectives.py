@@ -98,7 +98,7 @@ class Objective(ABC):
 class LargestMargin(Objective):
     """(21): max lambda."""
 
-    # Many forces may be optimal, and what tells them apart has a share of kappa^2: below 1e-6 rounding is felt.
+    # Many forces may be optimal; the term that selects one is of order kappa^2, which drowns in rounding below 1e-6.
     kappa = {"float64": 1e-6, "float32": 1e-4}
 
     def problem(self, grasps: Grasps, program: ScaledProgram) -> tuple[BlockProblem, jax.Array]:
