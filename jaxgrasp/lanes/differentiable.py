@@ -1,7 +1,10 @@
-"""Kernels over the lanes of a batch, with derivatives that are kernels, too.
+"""Functions over the lanes of a batch, with derivatives that are such functions, too.
 
-The values come from stages that JAX does not look into (the solver's loop runs in them). Derivatives come from
-functions of the same data that are as cheap as they can be, see `derivatives`; here they are applied to lanes.
+JAX does not look into the stages that compute the values: the solver's loop runs in them. So a `BatchedFunction` states
+its derivative itself, as a function of the same arguments; this module runs that function over the lanes.
+
+The arguments are a pytree of the caller's. Which leaves all lanes share, and which leaves change, is told
+by parallel pytrees: with the same structure, and a bool or a change in place of each array.
 """
 
 from abc import ABC, abstractmethod
@@ -19,48 +22,41 @@ from jaxgrasp.lanes.linear import linear_lanes, transposed_lanes
 from jaxgrasp.lanes.tiles import map_lanes
 
 Tree = Any
-Raw = dict[str, jax.Array]
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """How the arguments of a kernel lie: leaves (lanes, ...), or without the leading axis where shared.
+    """How the arguments of a batched function lie: leaves (lanes, ...), or without the leading axis where shared."""
 
-    admit: makes of them, lanes last, what the kernels take.
-    shared: by name of the argument.
-    rows: how many rows a lane has, which sets the size of a tile.
-    compact: whether a tile can be one function, see `map_lanes`.
-    tile: lanes of a tile that cannot.
-    known_as: tells `admit` from all others that take arguments of the same names and shapes.
-    """
-
-    admit: Callable[[Raw], Any]
-    shared: dict[str, bool]
+    admit: Callable[[Tree], Any]
+    """Turns the arguments, lanes last, into what the stages take: a function of a module, so that its name tells which
+    one it is."""
+    shared: Tree
+    """Whether all lanes share a leaf, a bool for each, parallel to the arguments."""
     rows: int
+    """The number of rows of a lane, which sets the size of a tile."""
     compact: bool
+    """Whether a tile can be one function, see `map_lanes`."""
     tile: int
-    known_as: str
+    """The number of lanes of a tile that cannot be one function."""
 
 
-class Kernel(Protocol):
-    """What is computed for every lane, and how it varies with the arguments."""
+class BatchedFunction(Protocol):
+    """A function that is computed for every lane, and how its results vary with the arguments."""
 
     @property
     def rows(self) -> int:
-        """How many rows a contact has but for the bound on its force, which sets the size of a tile."""
+        """The number of rows of a contact without the bound on its force, which sets the size of a tile."""
         ...
 
     @property
     def tile(self) -> int | None:
-        """None where it is free of library calls and large reductions, else how many lanes to work on.
-
-        See `map_lanes`.
-        """
+        """The number of lanes of a tile; None for a function without library calls and large reductions."""
         ...
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
-        """See `map_lanes`; the first takes (admitted arguments, held)."""
+        """The parts that run one after another, see `map_lanes`; the first takes (admitted arguments, held)."""
         ...
 
     def tangents(self, along: "Along", out: Tree, /) -> Tree:
@@ -70,25 +66,25 @@ class Kernel(Protocol):
 
 @dataclass(frozen=True)
 class OfPyramids:
-    """A kernel with the rows of friction pyramids."""
+    """A batched function with the rows of friction pyramids."""
 
     cone_edges: int
     tile = None
 
     @property
     def rows(self) -> int:
-        """See `Kernel`; for fewer than eight edges, tiles are large enough."""
+        """n_e, the number of rows of a contact; for fewer than eight, tiles are large enough."""
         return max(8, self.cone_edges)
 
 
 class Plain(ABC):
-    """A kernel of one stage that is its own derivative's function."""
+    """A batched function of one stage, which JAX differentiates."""
 
     tile = None
 
     @property
     def stages(self) -> tuple[Callable[..., Tree], ...]:
-        """See `Kernel`."""
+        """`evaluate` alone."""
         return (lambda admitted, _: self.evaluate(admitted),)
 
     @abstractmethod
@@ -96,83 +92,94 @@ class Plain(ABC):
         """The results, lanes last."""
 
     def tangents(self, along: "Along", out: Tree) -> Tree:
-        """See `Kernel`."""
+        """The derivative of `evaluate`."""
         return along.function(self.evaluate, out)
 
 
 @dataclass(frozen=True)
 class Along:
-    """A change of the arguments of all lanes; `moved` has those that change at all."""
+    """A change of the arguments of all lanes."""
 
     lanes: Lanes
-    arguments: Raw
-    moved: Raw
+    """How the arguments lie."""
+    arguments: Tree
+    """The arguments: leaves (lanes, ...), or without the leading axis where shared."""
+    changes: Tree
+    """The changes, parallel to the arguments: leaves (lanes, ...), None where a leaf does not change at all."""
 
     def function(self, function: Callable[[Any], Tree], like: Tree) -> Tree:
         """The derivative of `function(admitted arguments)`, lanes last, as JAX finds it."""
 
-        def kernel(arguments: Raw, moved: Raw) -> Tree:
-            at, start = self._admitted(arguments, moved)
-            return jax.jvp(lambda some: function(at(some)), (start,), (moved,))[1]
+        def kernel(arguments: Tree, changes: Tree) -> Tree:
+            at, start = self._admit_changed(arguments, changes)
+            return jax.jvp(lambda varied: function(at(varied)), (start,), (changes,))[1]
 
-        return linear_lanes(kernel, self.arguments, self.moved, self.lanes.shared, like)
+        return linear_lanes(kernel, self.arguments, self.changes, self.lanes.shared, like)
 
-    def adjoint(self, adjoint: Callable[[Any, Tree, Tree, frozenset], Any], held: Tree, like: Tree) -> Tree:
+    def adjoint(self, adjoint: Callable[[Any, Tree, Tree], Any], held: Tree, like: Tree, compact: bool = False) -> Tree:
         """The derivative whose transpose is given.
 
         Args:
-            adjoint: called with the admitted arguments, `held`, cotangents (like `like`, None where zero) and the names
-                of the arguments that change; returns the cotangents of the admitted arguments.
-            held: what it is given beside the arguments, leaves (lanes, ...).
+            adjoint: called with the admitted arguments, `held` and cotangents (like `like`, None where zero); returns
+                the cotangents of the admitted arguments.
+            held: what the adjoint is given beside the arguments, leaves (lanes, ...).
             like: arrays like the result.
+            compact: whether the adjoint, too, is free of library calls and large reductions, see `map_lanes`.
         """
-        names = frozenset(self.moved)
 
-        def back(data: tuple[Raw, Tree], cotangents: Tree) -> Raw:
+        def back(data: tuple[Tree, Tree], cotangents: Tree) -> Tree:
             arguments, held = data
             lanes = jax.tree.leaves(cotangents)[0].shape[-1]
-            like = {name: jnp.broadcast_to(arguments[name], (*arguments[name].shape[:-1], lanes)) for name in names}
-            at, start = self._admitted(arguments, like)
+            spread = lambda _, x: jnp.broadcast_to(x, (*x.shape[:-1], lanes))
+            at, start = self._admit_changed(arguments, _where_changed(spread, self.changes, arguments))
             admitted, pull = jax.vjp(at, start)
-            return pull(adjoint(admitted, held, cotangents, names))[0]
+            return pull(adjoint(admitted, held, cotangents))[0]
 
-        # With respect to the set itself there are reductions, and roots of matrices are library calls; what comes with
-        # actuators is JAX's own transpose.
-        compact = self.lanes.compact and "jacobian" not in self.arguments
-        compact &= not any(name.startswith("term") for name in names)
         shared = (self.lanes.shared, jax.tree.map(lambda _: False, held))
-        rows = self.lanes.rows if compact else 0
-        return transposed_lanes(back, (self.arguments, held), self.moved, shared, like, rows)
+        rows = self.lanes.rows if self.lanes.compact and compact else 0
+        return transposed_lanes(back, (self.arguments, held), self.changes, shared, like, rows)
 
-    def value(self, kernel: Kernel, held: Tree) -> Tree:
-        """Another kernel over the same arguments."""
-        return differentiable(kernel, self.lanes, self.arguments, held)
+    def value(self, function: BatchedFunction, held: Tree) -> Tree:
+        """The value of another batched function of the same arguments."""
+        return differentiable(function, self.lanes, self.arguments, held)
 
-    def _admitted(self, arguments: Raw, moved: Raw) -> tuple[Callable[[Raw], Any], Raw]:
+    def _admit_changed(self, arguments: Tree, changes: Tree) -> tuple[Callable[[Tree], Any], Tree]:
         """The admitted arguments as a function of those that change, and these."""
-        start = {name: jnp.broadcast_to(arguments[name], moved[name].shape) for name in moved}
-        return lambda some: self.lanes.admit({**arguments, **some}), start
+        start = _where_changed(lambda change, x: jnp.broadcast_to(x, change.shape), changes, arguments)
+        instead = lambda new, x: x if new is None else new
+        return lambda varied: self.lanes.admit(jax.tree.map(instead, varied, arguments, is_leaf=_is_none)), start
 
 
-def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()) -> Tree:
-    """Run a kernel over lanes; its derivatives with respect to the arguments, of any order, are its `tangents`.
+def _where_changed(function: Callable[[Any, Any], Any], changes: Tree, arguments: Tree) -> Tree:
+    """`function` of each change and its argument, None where there is no change."""
+    apply = lambda change, x: None if change is None else function(change, x)
+    return jax.tree.map(apply, changes, arguments, is_leaf=_is_none)
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
+
+
+def differentiable(function: BatchedFunction, lanes: Lanes, arguments: Tree, held: Tree = ()) -> Tree:
+    """Run a batched function over lanes; its derivatives with respect to the arguments, of any order, are `tangents`.
 
     Args:
-        kernel: what to run.
+        function: what to run.
         lanes: how the arguments lie.
-        arguments: by name.
-        held: what else the kernel is given, leaves (lanes, ...); constants to the derivative.
+        arguments: a pytree of arrays, leaves (lanes, ...), or without the leading axis where shared.
+        held: what else the function is given, leaves (lanes, ...); constants to the derivative.
     """
 
     @jax.custom_jvp
-    def value(arguments: Raw, held: Tree) -> Tree:
-        def enter(given: tuple[Raw, Tree]) -> Tree:
-            return kernel.stages[0](lanes.admit(given[0]), given[1])
+    def value(arguments: Tree, held: Tree) -> Tree:
+        def enter(inputs: tuple[Tree, Tree]) -> Tree:
+            return function.stages[0](lanes.admit(inputs[0]), inputs[1])
 
         shared = (lanes.shared, jax.tree.map(lambda _: False, held))
-        stages = (enter, *kernel.stages[1:])
-        # Kernels have no state but their fields, which are numbers and names.
-        known_as = f"{type(kernel).__module__}.{type(kernel).__qualname__} {vars(kernel)} {lanes.known_as}"
+        stages = (enter, *function.stages[1:])
+        # Batched functions have no state but their fields, which are numbers, names and types.
+        name = lambda x: f"{x.__module__}.{x.__qualname__}"
+        known_as = f"{name(type(function))} {vars(function)} {name(lanes.admit)}"
         return map_lanes(
             stages,
             (arguments, held),
@@ -189,14 +196,17 @@ def differentiable(kernel: Kernel, lanes: Lanes, arguments: Raw, held: Tree = ()
         arguments, held = primals
         out = value(arguments, held)
         count = jax.tree.leaves(out)[0].shape[0]
-        moved = {}
-        for name, dot in dots[0].items():
-            if type(dot) is not SymbolicZero:
-                moved[name] = jnp.broadcast_to(dot, (count, *dot.shape)) if lanes.shared[name] else dot
-        if not moved:
+
+        def change_of(dot: Any, shared: bool) -> jax.Array | None:
+            if type(dot) is SymbolicZero:
+                return None
+            return jnp.broadcast_to(dot, (count, *dot.shape)) if shared else dot
+
+        changes = jax.tree.map(change_of, dots[0], lanes.shared)
+        if not jax.tree.leaves(changes):
             return out, jax.tree.map(partial(zero_from_primal, symbolic_zeros=True), out)
-        change = kernel.tangents(Along(lanes, arguments, moved), out)
+        tangents = function.tangents(Along(lanes, arguments, changes), out)
         still = lambda x, dot: zero_from_primal(x, symbolic_zeros=True) if dot is None else dot
-        return out, jax.tree.map(still, out, change, is_leaf=lambda x: x is None)
+        return out, jax.tree.map(still, out, tangents, is_leaf=_is_none)
 
     return value(arguments, held)

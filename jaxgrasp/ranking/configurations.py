@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxgrasp.candidates import Candidates
-from jaxgrasp.contact import Actuation
+from jaxgrasp.contact import Actuation, Contacts
 from jaxgrasp.hands import HandObject
 
 # Configurations at a time.
 TILE = 1024
-_CONTACTS = ("positions", "frames", "friction", "max_force", "active")
+_CONTACTS = tuple(field.name for field in fields(Contacts))
+# Fields of `Actuation` that are the same in all configurations where the transmission is constant.
 _TRANSMISSION = {"transmission", "inverse", "unreached"}
 
 

@@ -1,8 +1,8 @@
 """What a hand's actuators add to (21) and (22): their efforts u as unknowns, J'f = B u, and limits under disturbance.
 
-While the disturbance w acts, contact forces change by -lambda G* w and efforts by -lambda A G* w with A = B^+ J', so
-the worst case of u <= u_max and -u <= -u_min is again a support function: h_D(-A G*) and h_D(A G*), row by row. G* is
-that of G and N'J' stacked: directions that no actuator reaches stay without torque.
+While the disturbance w acts, contact forces change by -lambda G* w and u by -lambda A G* w with A = B^+ J'. So the
+worst case of u <= u_max and -u <= -u_min is again a support function: h_D(-A G*) and h_D(A G*), row by row. G* belongs
+to the stacked rows of G and N'J': then directions that no actuator reaches stay without torque.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.solvers.block.kkt import Blocks
 
 # Rows shorter than this, in units of the others, are zero but for rounding.
-_NOTHING = {"float64": 1e-12, "float32": 1e-5}
+_SHORTEST_ROW = {"float64": 1e-12, "float32": 1e-5}
 
 
 class Actuated(NamedTuple):
@@ -37,12 +37,12 @@ class Actuated(NamedTuple):
     """(n_u, *lanes), u_max, finite."""
 
 
-class EffortRows(NamedTuple):
-    """The efforts' part of the scaled program; lanes trail.
+class ActuatorRows(NamedTuple):
+    """The actuators' part of the scaled program; lanes trail.
 
     columns: (eq, 1, n_u, *lanes), of the orthonormal equality rows.
     sigma, h: (2, n_u, *lanes), of u <= u_max and -u <= -u_min, scaled.
-    unit: (n_u, *lanes), effort per unit of unknown.
+    unit: (n_u, *lanes), actuator effort per unit of unknown.
     """
 
     columns: jax.Array
@@ -52,7 +52,7 @@ class EffortRows(NamedTuple):
 
     @property
     def blocks(self) -> Blocks:
-        """One unknown a block, with two rows."""
+        """The actuators as blocks of one unknown with two rows."""
         return Blocks(
             patterns=literal(np.array([[1.0], [-1.0]]), self.h.dtype),
             columns=self.columns,
@@ -64,17 +64,17 @@ class EffortRows(NamedTuple):
         )
 
 
-def effort_unit(actuated: Actuated) -> jax.Array:
-    """What the efforts are scaled by, (n_u, *lanes): their larger limit."""
+def actuator_unit(actuated: Actuated) -> jax.Array:
+    """The units of the actuator efforts, (n_u, *lanes): the larger limit of each."""
     largest = lax.stop_gradient(jnp.maximum(jnp.abs(actuated.upper), jnp.abs(actuated.lower)))
-    # An actuator without any effort is as good as one with hardly any.
+    # An actuator whose limits are zero is as good as one that hardly exerts anything.
     return jnp.maximum(largest, 1e-6 * jnp.maximum(fold(jnp.maximum, largest), 1e-6))
 
 
-def limited(actuated: Actuated, friction: jax.Array, max_force: jax.Array) -> Actuated:
-    """Limits beyond what bounded forces can ever ask for, infinite ones for example, brought down to that.
+def clip_limits(actuated: Actuated, friction: jax.Array, max_force: jax.Array) -> Actuated:
+    """Reduce limits that bounded forces can never reach, infinite ones for example, to the most that these ask for.
 
-    With |f_t| <= mu f_max and |f_n| <= f_max in every contact, no effort needs to be larger.
+    With |f_t| <= mu f_max and |f_n| <= f_max in every contact, no actuator effort needs to be larger.
     """
     reach = jnp.stack([friction, friction, jnp.ones_like(friction)]) * max_force
     torque = _torques(jnp.abs(actuated.joints), reach)
@@ -89,23 +89,23 @@ def limited(actuated: Actuated, friction: jax.Array, max_force: jax.Array) -> Ac
     )
 
 
-def stacked_rows(columns: jax.Array, actuated: Actuated | None) -> jax.Array:
-    """G (6, 3, n, *lanes), and below it N'J' where actuators do not reach every joint direction."""
+def stack_rows(columns: jax.Array, actuated: Actuated | None) -> jax.Array:
+    """Stack G (6, 3, n, *lanes) and N'J' where actuators do not reach every joint direction."""
     if actuated is None or actuated.unreached is None:
         return columns
-    bare = _times(actuated.unreached, actuated.joints)
-    return jnp.concatenate([columns, bare])
+    torqueless = _times(actuated.unreached, actuated.joints)
+    return jnp.concatenate([columns, torqueless])
 
 
-def effort_reach(actuated: Actuated, inverse: jax.Array, units: jax.Array) -> jax.Array:
-    """Wrenches -A G*, then A G*: (6, 2, n_u, *lanes) from G* (3, 6, n, *lanes)."""
+def actuator_reach(actuated: Actuated, inverse: jax.Array, units: jax.Array) -> jax.Array:
+    """The wrenches -A G*, then A G*, of the limits' rows: (6, 2, n_u, *lanes) from G* (3, 6, n, *lanes)."""
 
     @fenced
     def spread(inverse: jax.Array) -> jax.Array:
         def component(one: tuple) -> jax.Array:
             column, unit = one
-            effort = _times(actuated.inverse, _torques(actuated.joints, column)) * unit
-            return jnp.stack([-effort, effort])
+            change = _times(actuated.inverse, _torques(actuated.joints, column)) * unit
+            return jnp.stack([-change, change])
 
         return each(component, (jnp.moveaxis(inverse, 1, 0), units))
 
@@ -124,52 +124,52 @@ def _times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return fold(jnp.add, [c * v for c, v in zip(spread, vector, strict=True)])
 
 
-class Joined(NamedTuple):
-    """The equality rows of forces and efforts together, before they are made orthonormal.
+class JoinedRows(NamedTuple):
+    """The equality rows of contact forces and actuator efforts together, before they are made orthonormal.
 
     forces: (6 + n_v, 3, n, *lanes), of G f = b and J'f - B u = 0 for scaled forces.
-    efforts: (6 + n_v, 1, n_u, *lanes).
+    actuators: (6 + n_v, 1, n_u, *lanes).
     sizes: (n_v, *lanes), what the joints' rows were divided by.
     """
 
     forces: jax.Array
-    efforts: jax.Array
+    actuators: jax.Array
     sizes: jax.Array
 
 
-def joined_rows(actuated: Actuated, columns: jax.Array, scales: jax.Array, unit: jax.Array) -> Joined:
-    """The rows of G f = b and of J'f - B u = 0.
+def join_rows(actuated: Actuated, columns: jax.Array, scales: jax.Array, unit: jax.Array) -> JoinedRows:
+    """Join the rows of G f = b and of J'f - B u = 0.
 
     Args:
         actuated: the hand.
         columns: (6, 3, n, *lanes), those of G for scaled forces.
-        scales: (3, n, *lanes), what the forces are scaled by.
-        unit: (n_u, *lanes), what the efforts are.
+        scales: (3, n, *lanes), the units of the forces.
+        unit: (n_u, *lanes), the units of the actuator efforts.
     """
     torque = actuated.joints * scales
     effort = -actuated.transmission * unit
     squares = fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(torque**2, 1, 0)), 1, 0))
     sizes = lax.stop_gradient(jnp.sqrt(squares + fold(jnp.add, jnp.moveaxis(effort**2, 1, 0))))
-    sizes = jnp.where(sizes > _NOTHING[sizes.dtype.name], sizes, 1)
+    sizes = jnp.where(sizes > _SHORTEST_ROW[sizes.dtype.name], sizes, 1)
     effort = jnp.broadcast_to(effort / sizes[:, None], (*effort.shape[:2], *sizes.shape[1:]))
-    return Joined(
+    return JoinedRows(
         forces=jnp.concatenate([columns, torque / sizes[:, None, None]]),
-        efforts=jnp.concatenate([jnp.zeros((6, *effort.shape[1:]), effort.dtype), effort])[:, None],
+        actuators=jnp.concatenate([jnp.zeros((6, *effort.shape[1:]), effort.dtype), effort])[:, None],
         sizes=sizes,
     )
 
 
-def packed(rows: Joined) -> jax.Array:
-    """Both kinds of unknown as blocks of three, (eq, 3, n + ceil(n_u / 3), *lanes), for `whitened`."""
-    efforts = rows.efforts[:, 0]
-    spare = -efforts.shape[1] % 3
-    padded = jnp.concatenate([efforts, jnp.zeros((efforts.shape[0], spare, *efforts.shape[2:]), efforts.dtype)], 1)
+def pack(rows: JoinedRows) -> jax.Array:
+    """Write both kinds of unknown as blocks of three, (eq, 3, n + ceil(n_u / 3), *lanes), for `whitened`."""
+    columns = rows.actuators[:, 0]
+    spare = -columns.shape[1] % 3
+    padded = jnp.concatenate([columns, jnp.zeros((columns.shape[0], spare, *columns.shape[2:]), columns.dtype)], 1)
     blocks = padded.reshape(padded.shape[0], -1, 3, *padded.shape[2:])
     return jnp.concatenate([rows.forces, jnp.moveaxis(blocks, 2, 1)], 2)
 
 
-def unpacked(rows: jax.Array, contacts: int, actuators: int) -> tuple[jax.Array, jax.Array]:
-    """Of packed rows, the columns of forces (eq, 3, n, *lanes) and of efforts (eq, 1, n_u, *lanes)."""
+def unpack(rows: jax.Array, contacts: int, actuators: int) -> tuple[jax.Array, jax.Array]:
+    """Take the columns of forces (eq, 3, n, *lanes) and of actuators (eq, 1, n_u, *lanes) out of packed rows."""
     blocks = jnp.moveaxis(rows[:, :, contacts:], 1, 2)
-    efforts = blocks.reshape(rows.shape[0], -1, *rows.shape[3:])[:, :actuators]
-    return rows[:, :, :contacts], efforts[:, None]
+    columns = blocks.reshape(rows.shape[0], -1, *rows.shape[3:])[:, :actuators]
+    return rows[:, :, :contacts], columns[:, None]

@@ -14,6 +14,7 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.differentiable import Plain
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData
 
 
 def blocking_forces(
@@ -35,7 +36,8 @@ def blocking_forces(
     Raises:
         ValueError: shapes that do not fit.
     """
-    return over_grasps(_BlockingForces(), contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
+    data = GraspData.from_arguments(contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
+    return over_grasps(_BlockingForces(), data)
 
 
 @dataclass(frozen=True)
@@ -44,13 +46,13 @@ class _BlockingForces(Plain):
 
     def evaluate(self, grasps: Grasps) -> jax.Array:
         scaled = wrenches_of(grasps.terms) * grasps.units
-        if grasps.vertex_halves is None:
-            inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+        if grasps.vertex_inverse_roots is None:
+            inverse = pseudo_inverse(grasps.columns, grasps.inverse_root)[0]
             # Spelt out: products of matrices are library calls, which a tile cannot make.
             parts = [jnp.moveaxis(inverse[:, e], 0, 1) * scaled[:, e][:, None, None] for e in range(6)]
             forces = -fold(jnp.add, parts)
         else:
             one = lambda each: -jnp.einsum("aen...,e...->na...", pseudo_inverse(grasps.columns, each[0])[0], each[1])
-            forces = jax.lax.map(one, (grasps.vertex_halves, scaled))
+            forces = jax.lax.map(one, (grasps.vertex_inverse_roots, scaled))
         forces = jnp.where(grasps.present[:, None] > 0, forces, 0)
         return jnp.where(grasps.valid, forces, jnp.nan)

@@ -2,29 +2,28 @@
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxgrasp.arrays import as_float, fold
+from jaxgrasp.arrays import fold
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, inverse_root
 from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
-from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.kernels import usable
-from jaxgrasp.lanes.differentiable import Kernel, Lanes, differentiable
+from jaxgrasp.lanes.differentiable import BatchedFunction, Lanes, differentiable
 from jaxgrasp.lanes.direct import cut
 from jaxgrasp.lanes.tiles import LOOSE_TILE, TILE
-from jaxgrasp.robustness.actuators import Actuated, limited, stacked_rows
+from jaxgrasp.robustness.actuators import Actuated, clip_limits, stack_rows
 from jaxgrasp.robustness.auditing import audited
-from jaxgrasp.robustness.interface.arguments import Arguments, laid_out
-from jaxgrasp.robustness.interface.sizes import with_a_known_size
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs, Options, lay_out
+from jaxgrasp.robustness.interface.sizes import fill_to_known_size
 
 
 @jax.tree_util.register_dataclass
@@ -58,197 +57,178 @@ class Grasps:
     terms: tuple[Term, ...]
     """The disturbance set, moments in N m; leaves may have lanes of size 1."""
     extents: tuple[jax.Array, ...]
-    """(6, *lanes) each, the largest |w_i| of every term."""
-    half: jax.Array | None
+    """The largest |w_i| of every term of the disturbance set, (6, *lanes) each, N and N m."""
+    inverse_root: jax.Array | None
     """M with M M' = Q^-1, see `inverse_root`; None for Q = I."""
-    vertex_halves: jax.Array | None
-    """The same for each vertex of the disturbance set, along the leading axis."""
-    weights: jax.Array | None
-    """(n, 3, 3, *lanes), blocks of Q_0; None for I."""
+    vertex_inverse_roots: jax.Array | None
+    """M for each vertex of the disturbance set, along the leading axis."""
     weight_roots: jax.Array | None
-    """(3, 3, n, *lanes), R with R'R = Q_0."""
-    margin: jax.Array | None
-    """(*lanes), the margin that is asked for."""
-    smoothing: jax.Array | None
-    """(*lanes), kappa of the central point that is asked for."""
-    cutoff: jax.Array | None
-    """(*lanes), what the margin must reach to be of interest."""
+    """(3, 3, n, *lanes), R with R'R = Q_0; None for Q_0 = I."""
+    options: Options
+    """The options of the call, lanes trailing, made safe as well."""
     actuated: Actuated | None
-    """What the hand's actuators can do; None where the fingers can push at will."""
-
-    @property
-    def asked(self) -> jax.Array:
-        """`margin`, of grasps for which one is asked for."""
-        assert self.margin is not None
-        return self.margin
+    """The hand's actuators; None where the fingers can push at will."""
 
     @property
     def rows(self) -> jax.Array:
         """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
-        return stacked_rows(self.columns, self.actuated)
+        return stack_rows(self.columns, self.actuated)
 
 
-def over_grasps(
-    kernel: Kernel,
-    contacts: Contacts,
-    disturbances: DisturbanceSet,
-    required_wrench: Any = None,
-    compliance: Any = None,
-    cone_margin: Any = 0.0,
-    effort_weights: Any = None,
-    margin: Any = None,
-    smoothing: Any = None,
-    cutoff: Any = None,
-    actuation: Any = None,
-) -> Any:
-    """Check shapes, run a kernel over all grasps of a batch, audit its results and give them the batch's shape.
+def over_grasps(function: BatchedFunction, data: GraspData, options: Options | None = None) -> Any:
+    """Check shapes, run a function over all grasps of a batch, audit its results and give them the batch's shape.
 
-    The kernel takes `Grasps`. The contacts' dtype is the precision of everything. Compiled once for a kernel (they
-    compare by value) and the shapes, which `sizes` keeps few.
+    The function takes `Grasps`. It is compiled once for its value and for the shapes, which `sizes` keeps few.
+
+    Args:
+        function: what to run; it compares by value.
+        data: the grasps.
+        options: what is asked for; None is nothing beyond the grasps.
 
     Raises:
-        ValueError: shapes or kinds of argument that do not fit.
+        ValueError: shapes that do not fit.
     """
-    if not isinstance(contacts, Contacts):
-        raise ValueError(f"contacts: got {type(contacts).__name__}, wanted jaxgrasp.Contacts")
-    contacts.check_precision()
-    if not isinstance(disturbances, DisturbanceSet):
-        raise ValueError(f"disturbances: got {type(disturbances).__name__}, wanted jaxgrasp.DisturbanceSet")
-    given = {
-        "required_wrench": required_wrench,
-        "compliance": compliance,
-        "cone_margin": cone_margin,
-        "effort_weights": effort_weights,
-        "margin": margin,
-        "smoothing": smoothing,
-        "cutoff": cutoff,
-    }
-    for name, value in given.items():
-        if value is not None and not isinstance(value, Compliance):
-            given[name] = as_float(name, value, ())
-    if actuation is not None and not isinstance(actuation, Actuation):
-        raise ValueError(f"actuation: got {type(actuation).__name__}, wanted jaxgrasp.Actuation")
-    if actuation is not None and not actuation.transmission.shape[-1]:
-        raise ValueError("actuation: got no actuators, wanted at least one; leave it out and fingers push at will")
-    given["actuation"] = actuation
-    fill = with_a_known_size(kernel, contacts, disturbances, given)
+    options = options or Options()
+    fill = fill_to_known_size(function, data, options)
     if fill is None:
-        return audited(kernel, _run(kernel, contacts, disturbances, given), contacts, disturbances, given)
-    count = fill.count
-    out = _run(kernel, fill.contacts, disturbances, fill.given)
-    return cut(audited(kernel, out, fill.contacts, disturbances, fill.given, count), count)
+        return audited(function, _run(function, data, options), data, options)
+    out = _run(function, fill.data, fill.options)
+    return cut(audited(function, out, fill.data, fill.options, fill.count), fill.count)
 
 
 @functools.partial(compiled, static_argnums=(0,), pace=lambda *_: "brief" if usable() else "fast")
-def _run(kernel: Kernel, contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Any:
-    """Run the kernel over the lanes."""
-    arguments = laid_out(contacts, disturbances, given)
-    n = contacts.n_c
-    leaves, batch = arguments.leaves, arguments.batch
-
-    def admit(raw: dict[str, jax.Array]) -> Grasps:
-        return admitted(arguments, raw)
-
+def _run(function: BatchedFunction, data: GraspData, options: Options) -> Any:
+    """Run the function over the lanes."""
+    arguments = lay_out(data, options)
     # Library calls, as for the roots of Q, cannot be part of a compact tile.
-    compact = kernel.tile is None and not {"compliance", "per_vertex", "weights"} & set(leaves)
-    rows = n * (kernel.rows + 1)
-    if given["actuation"] is not None:
+    compact = function.tile is None and data.compliance is None and options.effort_weights is None
+    n = data.contacts.n_c
+    rows = n * (function.rows + 1)
+    if data.actuation is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.
-        joints, actuators = given["actuation"].transmission.shape[-2:]
+        joints, actuators = data.actuation.transmission.shape[-2:]
         rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
-    lanes = Lanes(admit, arguments.shared, rows, compact, kernel.tile or LOOSE_TILE, str(arguments.structure))
-    out = differentiable(kernel, lanes, leaves)
-    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
+    lanes = Lanes(admit, arguments.shared, rows, compact, function.tile or LOOSE_TILE)
+    out = differentiable(function, lanes, arguments.inputs)
+    return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), out)
 
 
-_TRANSMISSION = {"transmission", "inverse", "unreached"}
-
-
-def grasps_of(arguments: Arguments) -> Grasps:
+def admit_all(arguments: Arguments) -> Grasps:
     """The grasps of public arguments, outside of any kernel."""
-    leaves = arguments.leaves.items()
-    return admitted(arguments, {k: x[..., None] if arguments.shared[k] else jnp.moveaxis(x, 0, -1) for k, x in leaves})
+    last = lambda x, shared: x[..., None] if shared else jnp.moveaxis(x, 0, -1)
+    return admit(jax.tree.map(last, arguments.inputs, arguments.shared))
 
 
-def admitted(arguments: Arguments, raw: dict[str, jax.Array]) -> Grasps:
+def admit(inputs: Inputs) -> Grasps:
     """Check the data of every lane, lanes trailing, and replace what cannot be used."""
-    terms = arguments.terms(raw)
-    extents = tuple(raw[f"extent {i}"] for i in range(len(terms)))
-    positions, frames, active = raw["positions"], raw["frames"], raw["active"]
-    n, dtype = positions.shape[0], positions.dtype
-    sound = jnp.isfinite(positions).all(1) & rotations(frames)
-    sound &= (raw["friction"] >= 0) & jnp.isfinite(raw["friction"])
-    sound &= (raw["max_force"] > 0) & jnp.isfinite(raw["max_force"])
-    half, usable = inverse_root(_masked(raw.get("compliance"), active), n)
-    valid = (sound | ~active).all(0) & usable
-    # One Q a direction: the directions trail the lanes while the roots are taken.
-    vertex_halves = None
-    if "per_vertex" in raw:
-        each = jnp.moveaxis(raw["per_vertex"], 0, -1)
-        vertex_halves, usable = inverse_root(_masked(each, active[..., None]), n)
-        assert vertex_halves is not None
-        vertex_halves, valid = jnp.moveaxis(vertex_halves, -1, 0), valid & usable.all(-1)
-    weights, weight_roots = _masked(raw.get("weights"), active), None
-    if weights is not None:
-        valid &= inverse_root(weights, n)[1]
-        sane = jnp.where(valid, weights, jnp.eye(3, dtype=dtype)[..., None])
-        weight_roots = jnp.moveaxis(jnp.linalg.cholesky(jnp.moveaxis(sane, (1, 2), (-1, -2))), (-1, -2), (0, 1))
-    valid &= jnp.isfinite(raw["wrench"]).all(0) & (raw["reserve"] >= 0) & jnp.isfinite(raw["reserve"])
-    for extent in extents:
+    data, contacts = inputs.data, inputs.data.contacts
+    positions, frames, active = contacts.positions, contacts.frames, contacts.active
+    load = data.required_wrench
+    assert load is not None
+    valid = _usable_contacts(contacts)
+    root, vertex_roots, usable = _roots_of_compliance(data.compliance, active)
+    valid &= usable
+    weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, active, valid)
+    valid &= usable
+    valid &= jnp.isfinite(load).all(0) & (data.cone_margin >= 0) & jnp.isfinite(data.cone_margin)
+    for extent in inputs.extents:
         valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)
-    valid &= _sound_actuation(raw, active)
-    margin = raw.get("margin")
-    if margin is not None:
-        valid &= (margin >= 0) & jnp.isfinite(margin)
-        margin = jnp.where(valid, margin, 0)
-    smoothing = raw.get("smoothing")
-    if smoothing is not None:
-        valid &= (smoothing > 0) & jnp.isfinite(smoothing)
-        smoothing = jnp.where(valid, smoothing, 1)
+    if data.actuation is not None:
+        valid &= _usable_actuation(data.actuation, active)
+    options, valid = _admit_options(inputs.options, valid)
 
     # A choice of units: nothing that is reported in newtons and metres depends on it.
-    length, usable = _length(positions, active & valid, raw["wrench"], extents)
+    length, usable = _length(positions, active & valid, load, inputs.extents)
     valid &= usable
     length = jnp.where(valid, length, 1)
-    there = active & valid
-    positions = jnp.where(there, jnp.moveaxis(positions, 1, 0), 0)
-    frames = jnp.where(there, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
+    present = active & valid
+    positions = jnp.where(present, jnp.moveaxis(positions, 1, 0), 0)
+    frames = jnp.where(present, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
-    wrench = jnp.where(valid, raw["wrench"], 0)
-    friction, max_force = jnp.where(there, raw["friction"], 1), jnp.where(there, raw["max_force"], 1)
+    wrench = jnp.where(valid, load, 0)
+    friction, max_force = (jnp.where(present, x, 1) for x in (contacts.friction, contacts.max_force))
+    actuated = None
+    if data.actuation is not None:
+        actuated = _admit_actuation(data.actuation, present, valid, length)
+        actuated = clip_limits(actuated, friction, jnp.where(present, max_force, 0))
     return Grasps(
         valid=valid,
-        present=there.astype(dtype),
+        present=present.astype(positions.dtype),
         friction=friction,
         max_force=max_force,
         length=length,
         units=units,
         columns=grasp_columns(positions / length, frames),
-        lined=_lined(positions, there),
+        lined=_lined(positions, present),
         wrench=wrench * units,
-        reserve=jnp.where(valid, raw["reserve"], 0),
-        terms=terms,
-        extents=extents,
-        half=half,
-        vertex_halves=vertex_halves,
-        weights=weights,
+        reserve=jnp.where(valid, data.cone_margin, 0),
+        terms=data.disturbances.terms,
+        extents=inputs.extents,
+        inverse_root=root,
+        vertex_inverse_roots=vertex_roots,
         weight_roots=weight_roots,
-        margin=margin,
-        smoothing=smoothing,
-        cutoff=raw.get("cutoff"),
-        actuated=_actuated(raw, there, valid, length, friction, max_force) if "jacobian" in raw else None,
+        options=replace(options, effort_weights=weights),
+        actuated=actuated,
     )
 
 
-def _lined(positions: jax.Array, there: jax.Array) -> jax.Array:
-    """Whether the points (3, n, *lanes) that are there lie on one line.
+def _usable_contacts(contacts: Contacts) -> jax.Array:
+    """Whether the data of every contact that is there are admissible, (*lanes)."""
+    usable = jnp.isfinite(contacts.positions).all(1) & rotations(contacts.frames)
+    usable &= (contacts.friction >= 0) & jnp.isfinite(contacts.friction)
+    usable &= (contacts.max_force > 0) & jnp.isfinite(contacts.max_force)
+    return (usable | ~contacts.active).all(0)
+
+
+def _roots_of_compliance(
+    compliance: jax.Array | Compliance | None, active: jax.Array
+) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
+    """M with M M' = Q^-1, the same of every vertex of the set, and whether Q is positive definite, (*lanes)."""
+    n = active.shape[0]
+    if not isinstance(compliance, Compliance):
+        root, usable = inverse_root(_masked(compliance, active), n)
+        return root, None, usable
+    # One Q a direction: the directions trail the lanes while the roots are taken.
+    last = jnp.moveaxis(compliance.per_vertex, 0, -1)
+    roots, usable = inverse_root(_masked(last, active[..., None]), n)
+    assert roots is not None
+    return None, jnp.moveaxis(roots, -1, 0), usable.all(-1)
+
+
+def _roots_of_weights(
+    weights: jax.Array | None, active: jax.Array, valid: jax.Array
+) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
+    """Q_0 with the identity for absent contacts, R with R'R = Q_0, and whether it is positive definite, (*lanes)."""
+    masked = _masked(weights, active)
+    if masked is None:
+        return None, None, jnp.array(True)
+    usable = inverse_root(masked, active.shape[0])[1]
+    definite = jnp.where(valid & usable, masked, jnp.eye(3, dtype=masked.dtype)[..., None])
+    roots = jnp.linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
+    return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
+
+
+def _admit_options(options: Options, valid: jax.Array) -> tuple[Options, jax.Array]:
+    """The options with harmless ones for lanes that are not valid, and which lanes still are."""
+    margin, smoothing = options.margin, options.smoothing
+    if margin is not None:
+        valid &= (margin >= 0) & jnp.isfinite(margin)
+        margin = jnp.where(valid, margin, 0)
+    if smoothing is not None:
+        valid &= (smoothing > 0) & jnp.isfinite(smoothing)
+        smoothing = jnp.where(valid, smoothing, 1)
+    return replace(options, margin=margin, smoothing=smoothing), valid
+
+
+def _lined(positions: jax.Array, present: jax.Array) -> jax.Array:
+    """Whether the points (3, n, *lanes) that are present lie on one line, (*lanes).
 
     Products are compared, not subtracted: a difference of products may be rounded once or twice, as compilers like.
     """
     first, far = positions[:, 0], jnp.zeros_like(positions[:, 0])
     for i in range(1, positions.shape[1]):
-        first = jnp.where(there[:i].any(0), first, positions[:, i])
-    apart = jnp.where(there, positions - first[:, None], 0)
+        first = jnp.where(present[:i].any(0), first, positions[:, i])
+    apart = jnp.where(present, positions - first[:, None], 0)
     for i in range(positions.shape[1]):
         further = fold(jnp.maximum, jnp.abs(apart[:, i])) > fold(jnp.maximum, jnp.abs(far))
         far = jnp.where(further, apart[:, i], far)
@@ -257,14 +237,14 @@ def _lined(positions: jax.Array, there: jax.Array) -> jax.Array:
 
 
 def _length(
-    positions: jax.Array, there: jax.Array, wrench: jax.Array, extents: tuple[jax.Array, ...]
+    positions: jax.Array, present: jax.Array, wrench: jax.Array, extents: tuple[jax.Array, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """The root-mean-square distance of contacts (n, 3, *lanes), 1 where zero, and whether moments can be told in it."""
-    own = lax.stop_gradient(jnp.where(there, jnp.moveaxis(positions, 1, 0), 0))
+    """The root-mean-square distance of contacts (n, 3, *lanes), 1 where zero, and whether it can divide moments."""
+    own = lax.stop_gradient(jnp.where(present, jnp.moveaxis(positions, 1, 0), 0))
     # In units of the largest, whose square may be more, or less, than there are numbers for.
     largest = fold(jnp.maximum, fold(jnp.maximum, jnp.abs(own)))
     largest = jnp.where(largest > 0, largest, 1)
-    count = jnp.maximum(fold(jnp.add, there.astype(own.dtype)), 1)
+    count = jnp.maximum(fold(jnp.add, present.astype(own.dtype)), 1)
     mean = fold(jnp.add, fold(jnp.add, (own / largest) ** 2)) / count
     length = largest * jnp.sqrt(jnp.where(mean > 0, mean, 1))
     usable = jnp.isfinite(length) & jnp.isfinite(1 / length)
@@ -273,37 +253,30 @@ def _length(
     return length, usable
 
 
-def _sound_actuation(raw: dict[str, jax.Array], active: jax.Array) -> jax.Array:
+def _usable_actuation(actuation: Actuation, active: jax.Array) -> jax.Array:
     """Whether everything that is used is finite, and no limits cross, (*lanes)."""
-    if "jacobian" not in raw:
-        return jnp.array(True)
     # A sum is finite where all of its terms are. Spelt out: large reductions are library calls.
     total = lambda x: fold(jnp.add, fold(jnp.add, jnp.abs(x)))
-    sound = (jnp.isfinite(total(jnp.moveaxis(raw["jacobian"], 0, 2))) | ~active).all(0)
-    for name in sorted(_TRANSMISSION & set(raw)):
-        sound &= jnp.isfinite(total(raw[name]))
-    return sound & ((raw["lower"] <= raw["upper"]) & (raw["lower"] < jnp.inf) & (raw["upper"] > -jnp.inf)).all(0)
+    usable = (jnp.isfinite(total(jnp.moveaxis(actuation.jacobian, 0, 2))) | ~active).all(0)
+    for matrix in (actuation.inverse, actuation.transmission, actuation.unreached):
+        if matrix is not None:
+            usable &= jnp.isfinite(total(matrix))
+    lower, upper = actuation.lower, actuation.upper
+    return usable & ((lower <= upper) & (lower < jnp.inf) & (upper > -jnp.inf)).all(0)
 
 
-def _actuated(
-    raw: dict[str, jax.Array],
-    there: jax.Array,
-    valid: jax.Array,
-    length: jax.Array,
-    friction: jax.Array,
-    max_force: jax.Array,
-) -> Actuated:
-    jacobian = jnp.where(there[:, None, None], raw["jacobian"], 0)
-    sane = {name: jnp.where(valid, raw[name], 0) for name in sorted(_TRANSMISSION & set(raw))}
-    actuated = Actuated(
+def _admit_actuation(actuation: Actuation, present: jax.Array, valid: jax.Array, length: jax.Array) -> Actuated:
+    """The actuation in units of the length, harmless in lanes that are not valid."""
+    jacobian = jnp.where(present[:, None, None], actuation.jacobian, 0)
+    safe = lambda matrix: jnp.where(valid, matrix, 0)
+    return Actuated(
         joints=jnp.moveaxis(jacobian, (2, 1, 0), (0, 1, 2)) / length,
-        transmission=sane["transmission"] / length,
-        inverse=sane["inverse"] * length,
-        unreached=sane.get("unreached"),
-        lower=jnp.where(valid, raw["lower"], -1),
-        upper=jnp.where(valid, raw["upper"], 1),
+        transmission=safe(actuation.transmission) / length,
+        inverse=safe(actuation.inverse) * length,
+        unreached=jax.tree.map(safe, actuation.unreached),
+        lower=jnp.where(valid, actuation.lower, -1),
+        upper=jnp.where(valid, actuation.upper, 1),
     )
-    return limited(actuated, friction, jnp.where(there, max_force, 0))
 
 
 def _masked(matrices: jax.Array | None, active: jax.Array) -> jax.Array | None:

@@ -6,7 +6,7 @@ whatever kind of set D is.
 """
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,9 @@ from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.differentiable import OfPyramids, Plain
 from jaxgrasp.lanes.fence import each, fenced
-from jaxgrasp.robustness.actuators import effort_reach
+from jaxgrasp.robustness.actuators import actuator_reach
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData
 
 
 def worst_case(
@@ -53,35 +54,48 @@ def worst_case(
         ValueError: shapes or options that do not fit.
     """
     pyramid_facets(cone_edges)
-    return over_grasps(_WorstCase(cone_edges), contacts, disturbances, compliance=compliance)
+    data = GraspData.from_arguments(contacts, disturbances, compliance=compliance)
+    return over_grasps(_WorstCase(cone_edges), data)
 
 
 class _WorstCase(OfPyramids, Plain):
     def evaluate(self, grasps: Grasps) -> tuple[jax.Array, jax.Array]:
-        cone, bound, *_ = worst_rows(grasps, self.cone_edges)
-        hide = lambda x: jnp.where(grasps.valid, x, jnp.nan)
-        return hide(jnp.moveaxis(-cone, 0, 1)), hide(bound)
+        losses = worst_rows(grasps, self.cone_edges)
+        where_valid = lambda x: jnp.where(grasps.valid, x, jnp.nan)
+        return where_valid(jnp.moveaxis(-losses.cone, 0, 1)), where_valid(losses.bound)
 
 
-def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, jax.Array | None, Basis]:
-    """-S_1 (n_e, n, *lanes), S_2 (n, *lanes), the same of efforts (2, n_u, *lanes), and a basis of the rows.
+class RowLosses(NamedTuple):
+    """The amount that the worst unit disturbance takes from every row.
 
-    None for efforts without actuators; the basis is that of the rows of G, and of N'J'.
+    cone: (n_e, n, *lanes), -S_1, N.
+    bound: (n, *lanes), S_2, N.
+    actuators: (2, n_u, *lanes), of u <= u_max and -u <= -u_min; None without actuators.
+    basis: of the rows of G, and of N'J'.
     """
-    inverse, basis = pseudo_inverse(grasps.rows, grasps.half)
-    efforts = None
-    if grasps.vertex_halves is None:
+
+    cone: jax.Array
+    bound: jax.Array
+    actuators: jax.Array | None
+    basis: Basis
+
+
+def worst_rows(grasps: Grasps, cone_edges: int) -> RowLosses:
+    """Find what the worst unit disturbance takes from every row."""
+    inverse, basis = pseudo_inverse(grasps.rows, grasps.inverse_root)
+    actuators = None
+    if grasps.vertex_inverse_roots is None:
         reach = fenced(support)(grasps.terms, _directions(inverse, grasps.friction, grasps.units, cone_edges))
         if grasps.actuated is not None:
-            efforts = fenced(support)(grasps.terms, effort_reach(grasps.actuated, inverse[:, :6], grasps.units))
+            actuators = fenced(support)(grasps.terms, actuator_reach(grasps.actuated, inverse[:, :6], grasps.units))
     else:
 
         def worse(reach: tuple, vertex: tuple) -> tuple[tuple, None]:
-            half, wrench = vertex
-            inverse = pseudo_inverse(grasps.rows, half)[0]
+            inverse_root, wrench = vertex
+            inverse = pseudo_inverse(grasps.rows, inverse_root)[0]
             rows = [_directions(inverse, grasps.friction, grasps.units, cone_edges)]
             if grasps.actuated is not None:
-                rows.append(effort_reach(grasps.actuated, inverse[:, :6], grasps.units))
+                rows.append(actuator_reach(grasps.actuated, inverse[:, :6], grasps.units))
             pulls = [fold(jnp.add, row * wrench[:, None, None]) for row in rows]
             return tuple(jnp.maximum(r, p) for r, p in zip(reach, pulls, strict=True)), None
 
@@ -90,14 +104,14 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> tuple[jax.Array, jax.Array, j
         if grasps.actuated is not None:
             shapes.append((2, grasps.actuated.transmission.shape[1], *lanes))
         none = tuple(jnp.zeros(shape, grasps.present.dtype) for shape in shapes)
-        (reach, *rest), _ = lax.scan(worse, none, (grasps.vertex_halves, wrenches_of(grasps.terms)))
-        efforts = rest[0] if rest else None
+        (reach, *rest), _ = lax.scan(worse, none, (grasps.vertex_inverse_roots, wrenches_of(grasps.terms)))
+        actuators = rest[0] if rest else None
     reach = jnp.where(grasps.present > 0, reach, 0)
-    return reach[:-1], reach[-1], efforts, basis
+    return RowLosses(reach[:-1], reach[-1], actuators, basis)
 
 
 def _directions(inverse: jax.Array, friction: jax.Array, units: jax.Array, cone_edges: int) -> jax.Array:
-    """Wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6 or more, n, *lanes)."""
+    """The wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6 or more, n, *lanes)."""
 
     @fenced
     def spread(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
@@ -118,35 +132,34 @@ def reach_adjoint(
 ) -> tuple[jax.Array, jax.Array, jax.Array | None, tuple[Term, ...] | None]:
     """The transpose of the derivative of -S_1 and S_2.
 
-    Of a row a'G* that the worst wrench w of the set turns into h_D, da'w is left: the gradient with respect to G* is
-    a sum of w a' over the rows.
+    By Danskin's theorem d h_D(a) = w'da at the worst wrench w for a, and a row of C G* or E G* is a'G*: so the
+    cotangent of G* is the sum over the rows of a w', weighted by their cotangents.
 
     Args:
         grasps: the grasps.
         cone: (n_e, n, *lanes), cotangents of -S_1.
         bound: (n, *lanes), of S_2.
         cone_edges: n_e.
-        with_terms: whether those of the disturbance set are wanted.
+        with_terms: whether the cotangents of the disturbance set are wanted.
 
     Returns:
         Cotangents of the columns of G, friction, the roots of compliance (None for Q = I) and of the terms (None where
         not wanted).
     """
     weights = jnp.where(grasps.present > 0, jnp.concatenate([cone, bound[None]]), 0)
-    if grasps.vertex_halves is not None or with_terms:
-        # Rare, and nothing to save: by JAX's own hand.
-        data = (grasps.columns, grasps.friction, grasps.half, grasps.vertex_halves, grasps.terms)
+    if grasps.vertex_inverse_roots is not None or with_terms:
+        # Rare, with nothing to save: JAX differentiates the rows themselves.
+        data = (grasps.columns, grasps.friction, grasps.inverse_root, grasps.vertex_inverse_roots, grasps.terms)
 
-        def reach(columns: jax.Array, friction: jax.Array, half: Any, vertex_halves: Any, terms: Any) -> tuple:
-            changed = replace(
-                grasps, columns=columns, friction=friction, half=half, vertex_halves=vertex_halves, terms=terms
-            )
+        def reach(columns: jax.Array, friction: jax.Array, root: Any, vertex_roots: Any, terms: Any) -> tuple:
+            changed = replace(grasps, columns=columns, friction=friction, terms=terms)
+            changed = replace(changed, inverse_root=root, vertex_inverse_roots=vertex_roots)
             return worst_rows(changed, cone_edges)[:2]
 
-        columns, friction, half, vertex_halves, terms = jax.vjp(reach, *data)[1]((weights[:-1], weights[-1]))
-        return columns, friction, half if vertex_halves is None else vertex_halves, terms
+        columns, friction, root, vertex_roots, terms = jax.vjp(reach, *data)[1]((weights[:-1], weights[-1]))
+        return columns, friction, root if vertex_roots is None else vertex_roots, terms
 
-    inverse, _ = pseudo_inverse(grasps.columns, grasps.half)
+    inverse, _ = pseudo_inverse(grasps.columns, grasps.inverse_root)
     worst = fenced(furthest)(grasps.terms, _directions(inverse, grasps.friction, grasps.units, cone_edges))
 
     @fenced
@@ -166,12 +179,12 @@ def reach_adjoint(
     # (6, 3, n, *lanes), of the blocks of G*, and what comes with friction.
     pulled, along_normal = gather(worst, weights, grasps.friction, grasps.units)
     friction = -fold(jnp.add, along_normal * inverse[2])
-    columns, half = pseudo_inverse_adjoint(grasps.columns, grasps.half, pulled)
-    return columns, friction, half, None
+    columns, root = pseudo_inverse_adjoint(grasps.columns, grasps.inverse_root, pulled)
+    return columns, friction, root, None
 
 
 def reach_outside(grasps: Grasps, basis: Basis) -> jax.Array:
-    """How far the disturbance set reaches outside the range of G, as a share of its size, (*lanes).
+    """Measure how far the disturbance set reaches outside the range of G, as a share of its size, (*lanes).
 
     Args:
         grasps: the grasps and the set.

@@ -14,11 +14,8 @@ import jaxgrasp as jg
 from jaxgrasp.robustness import auditing
 from jaxgrasp.robustness.auditing.pyramids import Verdict
 from jaxgrasp.robustness.interface import sizes
+from jaxgrasp.robustness.interface.arguments import GraspData, Options
 from jaxgrasp.robustness.tightening.margin import _LargestDisturbance
-
-NOTHING = dict.fromkeys(
-    ("required_wrench", "compliance", "cone_margin", "effort_weights", "margin", "smoothing", "cutoff", "actuation")
-)
 
 
 @pytest.fixture(autouse=True)
@@ -27,8 +24,9 @@ def no_size_of_its_own(monkeypatch):
     monkeypatch.setattr(sizes, "_known", {})
 
 
-def known_size(contacts, disturbances=PUSHES, **given):
-    return sizes.with_a_known_size("a kernel", contacts, disturbances, NOTHING | given)
+def known_size(contacts, disturbances=PUSHES, margin=None, **given):
+    data = GraspData.from_arguments(contacts, disturbances, **given)
+    return sizes.fill_to_known_size("a kernel", data, Options(margin=margin))
 
 
 def test_answers_are_those_of_the_batch_itself():
@@ -47,9 +45,9 @@ def test_answers_are_those_of_the_batch_itself():
 def test_which_batches_are_filled():
     contacts, loads = grasps(13), jnp.zeros((13, 6))
     fill = known_size(contacts, required_wrench=loads, margin=jnp.ones(()))
-    assert fill.count == 13 and fill.contacts.batch_shape == (32,) and fill.given["margin"].shape == ()
-    np.testing.assert_array_equal(fill.contacts.positions[13:], jnp.stack([contacts.positions[12]] * 19))
-    np.testing.assert_array_equal(fill.given["required_wrench"].shape, (32, 6))
+    assert fill.count == 13 and fill.data.contacts.batch_shape == (32,) and fill.options.margin.shape == ()
+    np.testing.assert_array_equal(fill.data.contacts.positions[13:], jnp.stack([contacts.positions[12]] * 19))
+    np.testing.assert_array_equal(fill.data.required_wrench.shape, (32, 6))
     # Sizes that have programs, other axes, and what is not a direct call.
     other_axes = jax.tree.map(lambda x: x[None], contacts)
     assert known_size(grasps(32)) is None and known_size(grasps(1)) is None and known_size(other_axes) is None
@@ -67,7 +65,7 @@ def test_which_batches_are_filled():
 def test_each_grasp_with_its_own_actuation():
     contacts = grasps(13)
     hand = jg.Actuation.from_jacobian(jnp.ones((13, 4, 3, 2)), np.eye(2), -np.ones((13, 2)), np.ones(2))
-    fill = known_size(contacts, actuation=hand).given["actuation"]
+    fill = known_size(contacts, actuation=hand).data.actuation
     assert fill.jacobian.shape == (32, 4, 3, 2) and fill.lower.shape == (32, 2)
     assert fill.upper.shape == (2,) and fill.transmission.shape == (2, 2)
     short = replace(hand, jacobian=hand.jacobian[:, :3])
@@ -77,7 +75,7 @@ def test_each_grasp_with_its_own_actuation():
 def test_the_first_large_size_has_its_own(monkeypatch):
     monkeypatch.setattr(sizes, "_OWN", 1)
     filled = [known_size(grasps(count)) for count in (13, 700, 21, 900, 700, 64, 3000)]
-    assert [fill and fill.contacts.batch_shape for fill in filled] == [
+    assert [fill and fill.data.contacts.batch_shape for fill in filled] == [
         *((32,), None, (32,), (2048,), None, (128,), (4096,))
     ]
 
@@ -89,7 +87,8 @@ def test_copies_do_not_count_as_failed_answers(monkeypatch):
     monkeypatch.setattr(auditing, "_JUDGES", dict.fromkeys(auditing._JUDGES, lambda *_: (verdicts, flags.sum())))
     monkeypatch.setattr(auditing, "_corrected", lambda kernel, out, verdicts: out)
     monkeypatch.setattr(auditing.setting, "report", lambda *counts: told.append(counts))
-    auditing.audited(_LargestDisturbance(8, False), np.zeros(8), grasps(8), PUSHES, NOTHING, count=5)
+    data = GraspData.from_arguments(grasps(8), PUSHES)
+    auditing.audited(_LargestDisturbance(8, False), np.zeros(8), data, Options(), count=5)
     assert told == [(3, 5)]
 
 

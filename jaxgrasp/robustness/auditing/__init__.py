@@ -14,12 +14,10 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxgrasp.compiling import compiled
-from jaxgrasp.contact.contacts import Contacts
-from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness.auditing import setting
 from jaxgrasp.robustness.auditing.problem import every, picked
 from jaxgrasp.robustness.auditing.setting import audit
-from jaxgrasp.robustness.interface.arguments import Arguments, laid_out
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, lay_out
 
 __all__ = ["Audited", "audit", "audited", "hidden"]
 
@@ -61,9 +59,8 @@ def hidden(value: jax.Array, failed: jax.Array, instead: Any) -> jax.Array:
 def audited(
     kernel: Any,
     out: Tree,
-    contacts: Contacts,
-    disturbances: DisturbanceSet,
-    given: dict,
+    data: GraspData,
+    options: Options,
     count: int | None = None,
 ) -> Tree:
     """Audit the results of a kernel in the form that is chosen, see `setting.audit`.
@@ -73,16 +70,15 @@ def audited(
     Args:
         kernel: what was run; results of one that is not `Audited` are left as they are.
         out: its results, leaves (*batch, ...).
-        contacts: the grasps.
-        disturbances: the set D.
-        given: the other arguments by their public names.
+        data: the grasps.
+        options: what was asked for.
         count: how many answers count where the last ones are copies; None where all do.
     """
     form = setting.chosen_form()
     if form == "off" or not isinstance(kernel, Audited) or jax.tree.leaves(out)[0].size == 0:
         return out
     stride = 1 if form == "strict" else setting.STRIDE
-    still = jax.lax.stop_gradient((contacts, disturbances, given, out))
+    still = jax.lax.stop_gradient((data, options, out))
     first = jax.tree.leaves(out)[0]
     pace = "brief" if isinstance(first, Tracer) or first.size > _FEW else "soon"
     verdicts, failed = _JUDGES[pace](kernel, stride, *still, np.int32(setting.next_turn()))
@@ -96,10 +92,10 @@ def audited(
 
 
 def _verdicts(
-    kernel: Any, stride: int, contacts: Contacts, disturbances: DisturbanceSet, given: dict, out: Tree, turn: jax.Array
+    kernel: Any, stride: int, data: GraspData, options: Options, out: Tree, turn: jax.Array
 ) -> tuple[Tree, jax.Array]:
     """What the kernel judges, (*batch), and how many answers failed."""
-    arguments = laid_out(contacts, disturbances, given)
+    arguments = lay_out(data, options)
     lead = len(arguments.batch)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), out)
     lanes = jax.tree.leaves(flat)[0].shape[0]

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold_last
+from jaxgrasp.contact.actuation import Actuation
+from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.terms import Term
-from jaxgrasp.robustness.actuators import Actuated, limited
-from jaxgrasp.robustness.interface.arguments import Arguments
+from jaxgrasp.robustness.actuators import Actuated, clip_limits
+from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
 
 
 class Problem(NamedTuple):
@@ -58,61 +60,64 @@ class Hand(NamedTuple):
 
 def problem_of(arguments: Arguments) -> Problem:
     """The audit's view of the arguments; no derivative passes through it."""
-    leaves = {
-        name: jax.lax.stop_gradient(x[None] if arguments.shared[name] else x) for name, x in arguments.leaves.items()
-    }
-    present = leaves["active"]
-    here = lambda name, other: jnp.where(
-        present.reshape(*present.shape, *[1] * (leaves[name].ndim - 2)), leaves[name], other
+    leading = lambda x, shared: jax.lax.stop_gradient(x[None] if shared else x)
+    inputs: Inputs = jax.tree.map(leading, arguments.inputs, arguments.shared)
+    data, contacts, compliance = inputs.data, inputs.data.contacts, inputs.data.compliance
+    assert data.required_wrench is not None
+    present = contacts.active
+    here = lambda x, other: jnp.where(present.reshape(*present.shape, *[1] * (x.ndim - 2)), x, other)
+    positions, friction, max_force = (
+        here(contacts.positions, 0),
+        here(contacts.friction, 0),
+        here(contacts.max_force, 1),
     )
-    positions, friction, max_force = here("positions", 0), here("friction", 0), here("max_force", 1)
     count = jnp.maximum(fold_last(jnp.add, present.astype(positions.dtype)), 1)
     # In units of the largest, whose square may be more, or less, than there are numbers for.
     largest = fold_last(jnp.maximum, jnp.abs(positions), 2)
     largest = jnp.where(largest > 0, largest, 1)
     square = fold_last(jnp.add, (positions / largest[:, None, None]) ** 2, 2) / count
-    last = {name: jnp.moveaxis(x, 0, -1) for name, x in leaves.items() if name.startswith("term")}
-    terms = arguments.terms(last)
     strongest = jnp.where(present, max_force, 0)
     return Problem(
         positions=positions,
-        frames=here("frames", 0),
+        frames=here(contacts.frames, 0),
         friction=friction,
         max_force=max_force,
         present=present,
         size=largest * jnp.sqrt(jnp.where(square > 0, square, 1)),
-        wrench=leaves["wrench"],
-        reserve=leaves["reserve"],
-        terms=terms,
-        reach=sum(leaves[f"extent {i}"] for i in range(len(terms))),  # pyright: ignore[reportArgumentType]  # no sum of none
-        compliance=leaves.get("compliance"),
-        per_vertex=leaves.get("per_vertex"),
-        weights=leaves.get("weights"),
-        margin=leaves.get("margin"),
-        cutoff=leaves.get("cutoff"),
-        hand=_hand(leaves, here("jacobian", 0), friction, strongest) if "jacobian" in leaves else None,
+        wrench=data.required_wrench,
+        reserve=data.cone_margin,
+        terms=jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), data.disturbances.terms),
+        reach=sum(inputs.extents),  # pyright: ignore[reportArgumentType]  # no sum of none
+        compliance=None if isinstance(compliance, Compliance) else compliance,
+        per_vertex=compliance.per_vertex if isinstance(compliance, Compliance) else None,
+        weights=inputs.options.effort_weights,
+        margin=inputs.options.margin,
+        cutoff=inputs.options.cutoff,
+        hand=None
+        if data.actuation is None
+        else _hand(data.actuation, here(data.actuation.jacobian, 0), friction, strongest),
     )
 
 
-def _hand(leaves: dict[str, jax.Array], jacobian: jax.Array, friction: jax.Array, max_force: jax.Array) -> Hand:
+def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_force: jax.Array) -> Hand:
     last = lambda x: jnp.moveaxis(x, 0, -1)
-    limits = limited(
+    limits = clip_limits(
         Actuated(
             joints=jnp.moveaxis(jacobian, (3, 2, 1, 0), (0, 1, 2, 3)),
-            transmission=last(leaves["transmission"]),
-            inverse=last(leaves["inverse"]),
+            transmission=last(actuation.transmission),
+            inverse=last(actuation.inverse),
             unreached=None,
-            lower=last(leaves["lower"]),
-            upper=last(leaves["upper"]),
+            lower=last(actuation.lower),
+            upper=last(actuation.upper),
         ),
         last(friction),
         last(max_force),
     )
     return Hand(
         jacobian=jacobian,
-        transmission=leaves["transmission"],
-        inverse=leaves["inverse"],
-        unreached=leaves.get("unreached"),
+        transmission=actuation.transmission,
+        inverse=actuation.inverse,
+        unreached=actuation.unreached,
         lower=jnp.moveaxis(limits.lower, -1, 0),
         upper=jnp.moveaxis(limits.upper, -1, 0),
     )
@@ -120,8 +125,8 @@ def _hand(leaves: dict[str, jax.Array], jacobian: jax.Array, friction: jax.Array
 
 def picked(arguments: Arguments, turn: jax.Array, stride: int) -> Arguments:
     """The arguments of one lane in `stride`, see `every`."""
-    leaves = {name: x if arguments.shared[name] else every(x, turn, stride) for name, x in arguments.leaves.items()}
-    return replace(arguments, leaves=leaves)
+    pick = lambda x, shared: x if shared else every(x, turn, stride)
+    return replace(arguments, inputs=jax.tree.map(pick, arguments.inputs, arguments.shared))
 
 
 def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:

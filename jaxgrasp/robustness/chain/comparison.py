@@ -12,10 +12,11 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.records import record
-from jaxgrasp.robustness.chain.formulations import Chain, check_vertices, formulation_margin, tile_of
+from jaxgrasp.robustness.chain.formulations import Chain, check_vertices, choose_tile, formulation_margin
 from jaxgrasp.robustness.chain.programs import FORMULATIONS
 from jaxgrasp.robustness.chain.verdicts import FormulationSolution
 from jaxgrasp.robustness.grasps import over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.margin import largest_disturbance
 from jaxgrasp.solvers.status import Status
@@ -34,7 +35,7 @@ STEPS = {
 
 @record
 class Binding:
-    """Which constraint decides a margin: the one with the largest multiplier, forces in units of their bounds."""
+    """The constraint that decides a margin: it has the largest multiplier, forces in units of their bounds."""
 
     direction: Int[Array, "*batch"]
     """The disturbance, -1 where the forces at rest decide or there is no answer."""
@@ -59,7 +60,7 @@ class Comparison:
     statuses: dict[str, Int[Array, "*batch"]]
     """`Status`."""
     bindings: dict[str, Binding]
-    """What decides each margin."""
+    """The constraint that decides each margin."""
     gaps: dict[str, Float[Array, "*batch"]]
     """What each step of the chain costs: differences of margins, by the names of `STEPS`. Those with the same cones and
     the same bound are not negative; NaN where one of the two has no answer."""
@@ -100,13 +101,13 @@ def compare_formulations(
         raise ValueError(f"force_bound: got {force_bound!r}, wanted 'normal' or 'norm'")
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
-    kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", tile_of(contacts, disturbances))
-    found = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)
-    own: dict[str, FormulationSolution] = {name: solution for name, (solution, _) in found.items()}
+    kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", choose_tile(contacts, disturbances))
+    found = over_grasps(kernel, GraspData.from_arguments(contacts, disturbances, required_wrench, compliance))
+    unreduced: dict[str, FormulationSolution] = {name: solution for name, (solution, _) in found.items()}
     reduced = largest_disturbance(contacts, disturbances, required_wrench, compliance, cone_edges)
-    solutions: dict[str, FormulationSolution | Solution] = {**own, "21": reduced}
-    bindings = {name: Binding(direction=s.direction, contact=s.contact, row=s.row) for name, s in own.items()}
-    bindings["21"] = _binding(contacts, reduced, own["16"], cone_edges)
+    solutions: dict[str, FormulationSolution | Solution] = {**unreduced, "21": reduced}
+    bindings = {name: Binding(direction=s.direction, contact=s.contact, row=s.row) for name, s in unreduced.items()}
+    bindings["21"] = _binding(contacts, reduced, unreduced["16"], cone_edges)
     margins = {name: solution.margin for name, solution in solutions.items()}
     return Comparison(
         margins=margins,
@@ -118,12 +119,13 @@ def compare_formulations(
 
 
 def _difference(more: jax.Array, less: jax.Array) -> jax.Array:
+    """More - less, 0 where both are infinite."""
     same = jnp.isinf(more) & jnp.isinf(less)
     return jnp.where(same, 0, more - jnp.where(same, 0, less))
 
 
 def _binding(contacts: Contacts, reduced: Solution, unreduced: FormulationSolution, cone_edges: int) -> Binding:
-    """Of (21), whose rows do not tell the direction: that which loads the row most."""
+    """What decides (21), whose rows do not tell the direction: the one that loads the deciding row most."""
     friction, bound = (
         jnp.broadcast_to(x, reduced.bound_multipliers.shape) for x in (contacts.friction, contacts.max_force)
     )
@@ -141,22 +143,22 @@ def _binding(contacts: Contacts, reduced: Solution, unreduced: FormulationSoluti
     slip = moved[..., :2] @ facets[:, :2].T + mu * moved[..., 2:] * facets[:, 2]
     loads = jnp.concatenate([slip, -moved[..., 2:]], -1)
     loads = jnp.take_along_axis(loads, row[..., None, None], -1)[..., 0]
-    answered = jnp.isfinite(reduced.margin) & (reduced.margin >= 0) & (jnp.max(flat, -1) > 0)
+    binds = jnp.isfinite(reduced.margin) & (reduced.margin >= 0) & (jnp.max(flat, -1) > 0)
     direction = jnp.where(jnp.max(loads, -1) > 0, jnp.argmax(loads, -1), -1)
-    told = lambda v: jnp.where(answered, v, -1).astype(jnp.int32)
-    return Binding(direction=told(direction), contact=told(contact), row=told(row))
+    where_binding = lambda v: jnp.where(binds, v, -1).astype(jnp.int32)
+    return Binding(direction=where_binding(direction), contact=where_binding(contact), row=where_binding(row))
 
 
 @record
 class SpecifiedDisturbances:
-    """What `specified_disturbances` answers."""
+    """The result of `specified_disturbances`."""
 
     forces: Float[Array, "*batch contacts 3"]
     """f_0, contact frames, N: as far inside all rows as can be; 0 for absent contacts, NaN where there is none."""
     changes: Float[Array, "*batch directions contacts 3"]
     """delta f_j, contact frames, N."""
     margin: Float[Array, "*batch"]
-    """What the disturbances could be scaled by; NaN where b alone cannot be borne."""
+    """The factor by which the disturbances could be scaled; NaN where b alone cannot be borne."""
     status: Int[Array, "*batch"]
     """SOLVED where there are such forces, INFEASIBLE where there are none; otherwise as for the margin."""
 
@@ -205,9 +207,9 @@ def specified_disturbances(
     found = formulation_margin(contacts, disturbances, formulation, required_wrench, None, cone_edges, bound)
     margin = found.margin
     tolerance = 1e-7 if margin.dtype == jnp.float64 else 1e-4
-    answered = (found.status == Status.SOLVED) | (found.status == Status.UNBOUNDED)
-    holds = answered & (margin >= 1 - tolerance)
-    status = jnp.where(holds, Status.SOLVED, jnp.where(answered, Status.INFEASIBLE, found.status)).astype(jnp.int32)
+    has_margin = (found.status == Status.SOLVED) | (found.status == Status.UNBOUNDED)
+    holds = has_margin & (margin >= 1 - tolerance)
+    status = jnp.where(holds, Status.SOLVED, jnp.where(has_margin, Status.INFEASIBLE, found.status)).astype(jnp.int32)
     # At lambda = margin the forces are admissible, at 0 as well, so they are in between.
     share = jnp.where(holds, 1 / jnp.where(holds, margin, 1), jnp.nan)[..., None, None]
     moved = found.disturbed_forces - found.forces[..., None, :, :]

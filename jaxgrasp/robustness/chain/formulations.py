@@ -40,19 +40,19 @@ from jaxgrasp.robustness.chain.programs import (
     Basics,
     Formulation,
     Scaled,
-    basics,
+    compute_basics,
     contact_rows,
-    scaled_formulation,
+    scale_formulation,
 )
 from jaxgrasp.robustness.chain.verdicts import (
     ACCEPTED,
     FormulationSolution,
-    formulation_answer,
-    programs,
-    solved_program,
+    build_solution,
+    select_programs,
+    solve_program,
 )
-from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.interface.arguments import Arguments
+from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.conic.margin import ConicPoint
 from jaxgrasp.solvers.status import Status
@@ -120,8 +120,8 @@ def formulation_margin(
         raise ValueError(f"force_bound: got 'norm' for {formulation!r}, wanted 'normal', since pyramids are linear")
     check_vertices(disturbances)
     pyramid_facets(cone_edges)
-    kernel = Chain((formulation,), cone_edges, force_bound == "norm", tile_of(contacts, disturbances))
-    solved = over_grasps(kernel, contacts, disturbances, required_wrench=required_wrench, compliance=compliance)
+    kernel = Chain((formulation,), cone_edges, force_bound == "norm", choose_tile(contacts, disturbances))
+    solved = over_grasps(kernel, GraspData.from_arguments(contacts, disturbances, required_wrench, compliance))
     return solved[formulation][0]
 
 
@@ -135,10 +135,10 @@ def check_vertices(disturbances: DisturbanceSet) -> None:
         )
 
 
-def tile_of(contacts: Contacts, disturbances: DisturbanceSet) -> int:
-    """How many grasps to work on at a time.
+def choose_tile(contacts: Contacts, disturbances: DisturbanceSet) -> int:
+    """Choose how many grasps to work on at a time.
 
-    Of 32 to 1,024 with four contacts and six directions 32 were fastest, by a factor of five.
+    With four contacts and six directions 32 were fastest of 32 to 1,024, by a factor of five.
     """
     directions = wrenches_of(disturbances.terms).shape[-2] + 1
     return 1 << max(3, (_TILE // (contacts.n_c * directions)).bit_length() - 1)
@@ -146,7 +146,7 @@ def tile_of(contacts: Contacts, disturbances: DisturbanceSet) -> int:
 
 @dataclass(frozen=True)
 class Chain(Audited):
-    """The kernel of some formulations; its results are pairs of a solution and a scaled point, by name."""
+    """Some formulations as a batched function; its results are pairs of a solution and a scaled point, by name."""
 
     names: tuple[str, ...]
     cone_edges: int
@@ -155,21 +155,21 @@ class Chain(Audited):
 
     @property
     def rows(self) -> int:
-        """See `Kernel`."""
+        """The number of rows of a contact."""
         return self.cone_edges
 
     @property
     def stages(self) -> tuple:
-        """See `Kernel`."""
+        """Scale the grasps, solve the programs of all formulations, and decide from their outcomes."""
         solved = [name for name in self.names if self._twin(name) == name]
         return (
             lambda grasps, _: self._programs(grasps),
-            Each(dict.fromkeys(solved, solved_program)),
-            lambda given: self._answers(*given),
+            Each(dict.fromkeys(solved, solve_program)),
+            lambda solved: self._solutions(*solved),
         )
 
     def tangents(self, along: Along, out: dict) -> dict:
-        """See `Kernel`."""
+        """The derivative by the envelope theorem."""
         values = {name: (solution.margin, solution.directions) for name, (solution, _) in out.items()}
         changes = along.adjoint(self._adjoint, out, values)
         changed = {}
@@ -182,20 +182,20 @@ class Chain(Audited):
         return changed
 
     def judge(self, arguments: Arguments, out: dict, anew: bool) -> dict[str, ChainVerdict]:
-        """See `Audited`."""
+        """Hold every lane against the rules of the audit."""
         problem = problem_of(arguments)
-        shared, scaled = self._scaled(grasps_of(arguments)) if anew else (None, {})
+        basics, scaled = self._scaled(admit_all(arguments)) if anew else (None, {})
         return {
-            name: self._judged(name, problem, solution, point, shared, scaled.get(self._twin(name)))
+            name: self._judged(name, problem, solution, point, basics, scaled.get(self._twin(name)))
             for name, (solution, point) in out.items()
         }
 
     def spot(self, arguments: Arguments, out: dict) -> dict[str, jax.Array]:
-        """See `Audited`: programs put together anew take as long to compile as they did at first."""
+        """Nothing: programs put together anew take as long to compile as they did at first."""
         return {name: jnp.zeros(solution.margin.shape, bool) for name, (solution, _) in out.items()}
 
     def correct(self, out: dict, verdicts: dict[str, ChainVerdict]) -> dict:
-        """See `Audited`."""
+        """Take back what the audit does not confirm."""
         changed = {}
         for name, (solution, point) in out.items():
             failed, confirmed = verdicts[name]
@@ -211,7 +211,7 @@ class Chain(Audited):
         problem: Problem,
         solution: FormulationSolution,
         point: ConicPoint,
-        shared: Basics | None,
+        basics: Basics | None,
         scaled: Scaled | None,
     ) -> ChainVerdict:
         """The audit of one formulation; with programs put together anew also of what multipliers prove."""
@@ -231,13 +231,13 @@ class Chain(Audited):
             each = jax.vmap(lambda f, w: balanced(problem, f, w) & admissible(problem, f, *check), (1, 1), 1)
             holds &= (each(forces, wrenches) | ~looked_at).all(1)
         scale, proven = jnp.ones_like(margin), None
-        if shared is not None and scaled is not None:
+        if basics is not None and scaled is not None:
             last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), point)
             bounds = proven_bounds(scaled.problem, last) * scaled.scale
             bounds = jnp.broadcast_to(bounds[: 1 if bounds.shape[0] == 1 else directions.shape[1]], directions.T.shape)
-            bounds = jnp.where(shared.outside, 0, jnp.where(shared.disturbed, bounds, jnp.inf))
+            bounds = jnp.where(basics.outside, 0, jnp.where(basics.disturbed, bounds, jnp.inf))
             proven, scale = jnp.min(bounds, 0), jnp.max(scaled.scale, 0)
-            if not form.free and form.shared and problem.per_vertex is None:
+            if not form.free and form.one_f0 and problem.per_vertex is None:
                 changes = solution.disturbed_forces - solution.forces[:, None]
                 holds &= blocking_forces_stand(problem, changes, margin)
         else:
@@ -247,38 +247,38 @@ class Chain(Audited):
         return ChainVerdict(claimed & ~solved, jnp.where(holds, margin, jnp.nan))
 
     def _scaled(self, grasps: Grasps) -> tuple[Basics, dict[str, Scaled]]:
-        """By name; formulations that solve the same programs share them."""
+        """The scaled programs by name of the formulation; those that solve the same programs share them."""
         forms = {name: FORMULATIONS[name] for name in self.names}
-        shared = basics(grasps, any(not form.free for form in forms.values()))
+        basics = compute_basics(grasps, any(not form.free for form in forms.values()))
         found: dict[str, Scaled] = {}
         for name, form in forms.items():
             if self._twin(name) == name:
                 norm_bound = self.norm_bound and form.exact
-                found[name] = scaled_formulation(grasps, shared, form, self.cone_edges, norm_bound)
-        return shared, found
+                found[name] = scale_formulation(grasps, basics, form, self.cone_edges, norm_bound)
+        return basics, found
 
     def _twin(self, name: str) -> str:
-        """The formulation whose programs this one shares: with free answers, an f_0 for all costs nothing more."""
+        """The formulation whose programs this one shares: with free reactions, one f_0 for all costs nothing more."""
         form = FORMULATIONS[name]
         return next(o for o in self.names if FORMULATIONS[o][:2] == form[:2] and (form.free or o == name))
 
     def _programs(self, grasps: Grasps) -> tuple:
-        shared, scaled = self._scaled(grasps)
-        wanted = {name: programs(grasps, shared, own, FORMULATIONS[name].free) for name, own in scaled.items()}
+        basics, scaled = self._scaled(grasps)
+        selected = {name: select_programs(grasps, basics, own, FORMULATIONS[name].free) for name, own in scaled.items()}
         scales = {name: own.scale for name, own in scaled.items()}
-        return (replace(grasps, terms=(), extents=()), shared, scales), wanted
+        return (replace(grasps, terms=(), extents=()), basics, scales), selected
 
-    def _answers(self, kept: tuple, solved: dict[str, ConicOutcome]) -> dict:
-        grasps, shared, scales = kept
-        answers = {}
+    def _solutions(self, scaled_grasps: tuple, solved: dict[str, ConicOutcome]) -> dict:
+        grasps, basics, scales = scaled_grasps
+        solutions = {}
         for name in self.names:
             twin, form = self._twin(name), FORMULATIONS[name]
             rows = contact_rows(form.exact, self.cone_edges, self.norm_bound and form.exact, grasps.friction)
-            solution = formulation_answer(grasps, shared, scales[twin], rows, form, solved[twin])
-            answers[name] = solution, solved[twin].point
-        return answers
+            solution = build_solution(grasps, basics, scales[twin], rows, form, solved[twin])
+            solutions[name] = solution, solved[twin].point
+        return solutions
 
-    def _adjoint(self, grasps: Grasps, held: dict, cotangents: dict, names: frozenset) -> Grasps:
+    def _adjoint(self, grasps: Grasps, held: dict, cotangents: dict) -> Grasps:
         """The gradient of the Lagrangians with respect to the data, times cotangents of margins and directions."""
         _, scaled = self._scaled(grasps)
         weights, points = {}, {}
@@ -296,19 +296,19 @@ class Chain(Audited):
 
 
 def _program_weights(solution: FormulationSolution, cotangents: tuple, scaled: Scaled, form: Formulation) -> jax.Array:
-    """What cotangents of margin and directions ask of the optima of the programs, (D, *lanes)."""
+    """Turn cotangents of margin and directions into those of the optima of the programs, (D, *lanes)."""
     directions, scale = solution.directions, scaled.scale
-    given = jnp.zeros_like(directions)
+    weights = jnp.zeros_like(directions)
     if cotangents[0] is not None:
-        binds = jnp.arange(given.shape[0])[:, None] == jnp.argmin(directions, 0)
-        given = given + jnp.where(binds, cotangents[0], 0)
+        binds = jnp.arange(weights.shape[0])[:, None] == jnp.argmin(directions, 0)
+        weights = weights + jnp.where(binds, cotangents[0], 0)
     if cotangents[1] is not None:
-        given = given + cotangents[1]
-    # What is zero is flat, or zero by definition.
-    least = ACCEPTED[scale.dtype.name] * (scale if scale.shape[0] == 1 else scale[: given.shape[0]])
-    given = jnp.where(jnp.isfinite(directions) & (directions > least), given, 0)
+        weights = weights + cotangents[1]
+    # A margin of zero is flat, or zero by definition.
+    least = ACCEPTED[scale.dtype.name] * (scale if scale.shape[0] == 1 else scale[: weights.shape[0]])
+    weights = jnp.where(jnp.isfinite(directions) & (directions > least), weights, 0)
     if form.free:
-        given = jnp.concatenate([given, jnp.zeros_like(given[:1])])
-    elif form.shared:
-        given = fold(jnp.add, given)[None]
-    return given * scale
+        weights = jnp.concatenate([weights, jnp.zeros_like(weights[:1])])
+    elif form.one_f0:
+        weights = fold(jnp.add, weights)[None]
+    return weights * scale

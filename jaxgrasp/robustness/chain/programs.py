@@ -1,9 +1,10 @@
 """The formulations (12), (13), (16) and their like as conic programs in scaled form.
 
-Two shapes. Where the answer delta f_j to a disturbance is free, f_0 + delta f_j is a force of its own: the directions
-fall apart, one program each, max lambda with G f = b - lambda W_j, and f_0 another. Where delta f_j is the blocking
-force (15), one f_0 is shared. Coulomb's cones then come in copies, one for each direction and one for rest; of linear
-rows that differ only in what lambda takes from them, the strictest is enough, since lambda >= 0 is asked for.
+The programs have two shapes. Where the reaction delta f_j to a disturbance is free, f_0 + delta f_j is a force of its
+own: the directions decouple, one program each, max lambda with G f = b - lambda W_j, and f_0 has another program. Where
+delta f_j is the blocking force (15), all directions share f_0. Coulomb's cones then come in copies, one for each
+direction and one for rest; of linear rows that differ only in what lambda takes from them, the strictest is enough,
+since lambda >= 0 is asked for.
 
 Per contact forces are scaled as in `program`: tangential by mu F, normal by F.
 """
@@ -27,35 +28,35 @@ from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
 
 
 class Formulation(NamedTuple):
-    """What distinguishes the formulations.
+    """The properties in which the formulations differ.
 
     exact: Coulomb's cones, not pyramids.
     free: delta f_j is free, not the blocking force (15).
-    shared: there has to be one f_0 for all directions.
+    one_f0: there has to be one f_0 for all directions.
     """
 
     exact: bool
     free: bool
-    shared: bool
+    one_f0: bool
 
 
 FORMULATIONS = {
-    "12": Formulation(exact=True, free=True, shared=True),
-    "12_fixed": Formulation(exact=True, free=False, shared=True),
-    "13": Formulation(exact=False, free=True, shared=True),
-    "16": Formulation(exact=False, free=False, shared=True),
-    "per_direction": Formulation(exact=False, free=True, shared=False),
-    "per_direction_prestrained": Formulation(exact=False, free=False, shared=False),
+    "12": Formulation(exact=True, free=True, one_f0=True),
+    "12_fixed": Formulation(exact=True, free=False, one_f0=True),
+    "13": Formulation(exact=False, free=True, one_f0=True),
+    "16": Formulation(exact=False, free=False, one_f0=True),
+    "per_direction": Formulation(exact=False, free=True, one_f0=False),
+    "per_direction_prestrained": Formulation(exact=False, free=False, one_f0=False),
 }
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class Basics:
-    """What all formulations share; lanes trail."""
+    """The scaled data that all formulations share; lanes trail."""
 
     sizes: jax.Array
-    """(3, n, *lanes), N: forces = sizes * x."""
+    """(3, n, *lanes), the units of forces, N: f = sizes * x."""
     columns: jax.Array
     """(6, 3, n, *lanes), the orthonormal rows of G for scaled forces; zero where dropped."""
     dropped: jax.Array
@@ -65,15 +66,15 @@ class Basics:
     load: jax.Array
     """(6, *lanes), b in the orthonormal rows."""
     targets: jax.Array
-    """(6, n_d, *lanes), W_j in them."""
-    answers: jax.Array | None
-    """(n_d, 3, n, *lanes): blocking forces for lambda = 1, N; None where no formulation asks for them."""
+    """(6, n_d, *lanes), W_j in the orthonormal rows."""
+    blocking_forces: jax.Array | None
+    """(n_d, 3, n, *lanes), the blocking forces for lambda = 1, N; None where no formulation asks for them."""
     disturbed: jax.Array
-    """bool (n_d, *lanes): W_j is not zero."""
+    """bool (n_d, *lanes), whether W_j is not zero."""
     outside: jax.Array
-    """bool (n_d, *lanes): W_j is outside the range of G."""
+    """bool (n_d, *lanes), whether W_j is outside the range of G."""
     load_outside: jax.Array
-    """bool (*lanes): b is."""
+    """bool (*lanes), whether b is outside the range of G."""
 
 
 @jax.tree_util.register_dataclass
@@ -81,7 +82,7 @@ class Basics:
 class Scaled:
     """The programs of one formulation; lanes are (programs of a grasp, grasps).
 
-    Free answers: one program a direction, then that of f_0. Blocking forces: one program, or one a direction.
+    Free reactions: one program a direction, then that of f_0. Blocking forces: one program, or one a direction.
     """
 
     problem: ConicMargin
@@ -89,8 +90,8 @@ class Scaled:
     """(D, *lanes): lambda = scale * lambda_hat."""
 
 
-def basics(grasps: Grasps, with_answers: bool) -> Basics:
-    """Scale a batch of grasps."""
+def compute_basics(grasps: Grasps, with_blocking_forces: bool) -> Basics:
+    """Scale a batch of grasps, as far as all formulations need it."""
     dtype, present = grasps.present.dtype, grasps.present
     tolerance = 10 * RANK_TOLERANCE[dtype.name]
     tangential = jnp.maximum(grasps.friction, LEAST_FRICTION[dtype.name]) * grasps.max_force
@@ -99,15 +100,15 @@ def basics(grasps: Grasps, with_answers: bool) -> Basics:
     mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
     rows = whitened(grasps.columns * (sizes / mean))
     (lanes,) = mean.shape
-    given = wrenches_of(grasps.terms)
-    wrenches = jnp.swapaxes(jnp.broadcast_to(given, (*given.shape[:2], lanes)), 0, 1) * grasps.units[:, None]
+    vertices = wrenches_of(grasps.terms)
+    wrenches = jnp.swapaxes(jnp.broadcast_to(vertices, (*vertices.shape[:2], lanes)), 0, 1) * grasps.units[:, None]
 
     def coordinates(wrench: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """In the orthonormal rows, and whether something is left outside them."""
+        """Express a wrench in the orthonormal rows, and tell whether something of it is outside them."""
         spread = lambda x: x.reshape(*x.shape[:-1], *[1] * (wrench.ndim - 2), lanes)
-        own = fold(jnp.add, [spread(rows.operations[:, c]) * wrench[c] for c in range(6)])
-        lost = fold(jnp.maximum, jnp.abs(lax.stop_gradient(own)) * (1 - spread(rows.kept)))
-        return own * spread(rows.kept), lost > tolerance * fold(jnp.maximum, jnp.abs(wrench))
+        inside = fold(jnp.add, [spread(rows.operations[:, c]) * wrench[c] for c in range(6)])
+        outside = fold(jnp.maximum, jnp.abs(lax.stop_gradient(inside)) * (1 - spread(rows.kept)))
+        return inside * spread(rows.kept), outside > tolerance * fold(jnp.maximum, jnp.abs(wrench))
 
     load, load_outside = coordinates(grasps.wrench / mean)
     targets, outside = coordinates(wrenches / mean)
@@ -118,19 +119,19 @@ def basics(grasps: Grasps, with_answers: bool) -> Basics:
         wrenches=wrenches,
         load=load,
         targets=targets,
-        answers=blocking(grasps, wrenches) if with_answers else None,
+        blocking_forces=compute_blocking_forces(grasps, wrenches) if with_blocking_forces else None,
         disturbed=fold(jnp.maximum, jnp.abs(wrenches)) > 0,
         outside=outside,
         load_outside=load_outside,
     )
 
 
-def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_edges: int, norm_bound: bool) -> Scaled:
+def scale_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_edges: int, norm_bound: bool) -> Scaled:
     """The programs of one formulation for a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
     count, lanes = basics.disturbed.shape
     parts = contact_rows(form.exact, cone_edges, norm_bound, grasps.friction)
-    kinds = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
+    identities = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
     if form.free:
         length = jnp.sqrt(lax.stop_gradient(fold(jnp.add, basics.targets * basics.targets)))
         scale = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 1)
@@ -138,27 +139,27 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
         scale = jnp.concatenate([scale, jnp.ones((1, lanes), dtype)])
         # The last program is for f_0: how deep inside all rows it can be.
         last = (jnp.arange(count + 1) == count).astype(dtype)[:, None]
-        sigmas = [kind * last for kind in kinds]
+        sigmas = [identity * last for identity in identities]
     else:
-        border = jnp.zeros((6, 1 if form.shared else count, lanes), dtype)
-        assert basics.answers is not None
-        given = jnp.moveaxis(basics.answers / basics.sizes, 0, 2)
-        sigmas = [jnp.where(present[:, None] > 0, part.apply(given), 0) for part in parts]
+        border = jnp.zeros((6, 1 if form.one_f0 else count, lanes), dtype)
+        assert basics.blocking_forces is not None
+        changes = jnp.moveaxis(basics.blocking_forces / basics.sizes, 0, 2)
+        sigmas = [jnp.where(present[:, None] > 0, part.apply(changes), 0) for part in parts]
         if not form.exact:
             # The strictest of all directions and of rest, for which it is 0.
             sigmas = [jnp.maximum(sigma, 0) for sigma in sigmas]
-            sigmas = [jnp.max(sigma, 3, keepdims=True) if form.shared else sigma for sigma in sigmas]
+            sigmas = [jnp.max(sigma, 3, keepdims=True) if form.one_f0 else sigma for sigma in sigmas]
         largest = fold(jnp.maximum, [jnp.max(jnp.abs(sigma), (0, 1, 2)) for sigma in sigmas])
-        if form.shared and form.exact:
+        if form.one_f0 and form.exact:
             largest = jnp.max(largest, 0, keepdims=True)
             # Directions become copies, (d, n_d, n, 1, *lanes).
             sigmas = [jnp.swapaxes(sigma, 1, 3) for sigma in sigmas]
         # Where nothing disturbs, lambda asks how deep inside all rows f_0 can be.
-        idle = largest == 0
-        scale = lax.stop_gradient(1 / jnp.where(idle, 1, largest))
+        undisturbed = largest == 0
+        scale = lax.stop_gradient(1 / jnp.where(undisturbed, 1, largest))
         if form.exact:
             sigmas = [jnp.concatenate([sigma, jnp.zeros_like(sigma[:, :1])], 1) for sigma in sigmas]
-        sigmas = [jnp.where(idle, kind, sigma * scale) for sigma, kind in zip(sigmas, kinds, strict=True)]
+        sigmas = [jnp.where(undisturbed, one, sigma * scale) for sigma, one in zip(sigmas, identities, strict=True)]
     lift = lambda sigma: jnp.broadcast_to(sigma, (*sigma.shape[:3], *border.shape[1:]))
     problem = ConicMargin(
         rows=tuple(replace(part, sigma=lift(sigma)) for part, sigma in zip(parts, sigmas, strict=True)),
@@ -170,14 +171,14 @@ def scaled_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_e
     return Scaled(problem=problem, scale=scale)
 
 
-def blocking(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
-    """-G*_j W_j (n_d, 3, n, *lanes) of wrenches (6, n_d, *lanes), N."""
-    if grasps.vertex_halves is None:
-        inverse = pseudo_inverse(grasps.columns, grasps.half)[0]
+def compute_blocking_forces(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
+    """Blocking forces -G*_j W_j (n_d, 3, n, *lanes) against wrenches (6, n_d, *lanes), N."""
+    if grasps.vertex_inverse_roots is None:
+        inverse = pseudo_inverse(grasps.columns, grasps.inverse_root)[0]
         forces = -jnp.einsum("aen...,ed...->dan...", inverse, wrenches)
     else:
         one = lambda each: -jnp.einsum("aen...,e...->an...", pseudo_inverse(grasps.columns, each[0])[0], each[1])
-        forces = lax.map(one, (grasps.vertex_halves, jnp.swapaxes(wrenches, 0, 1)))
+        forces = lax.map(one, (grasps.vertex_inverse_roots, jnp.swapaxes(wrenches, 0, 1)))
     return jnp.where(grasps.present > 0, forces, 0)
 
 

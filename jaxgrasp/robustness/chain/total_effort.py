@@ -1,4 +1,4 @@
-"""The least-effort program (11) over the tightening forces and all answers to the disturbances."""
+"""The least-effort program (11) over the tightening forces and all reactions to the disturbances."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -8,7 +8,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxgrasp.arrays import fold
+from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
@@ -25,11 +25,11 @@ from jaxgrasp.robustness.auditing.chain import (
 )
 from jaxgrasp.robustness.auditing.problem import problem_of
 from jaxgrasp.robustness.auditing.pyramids import balanced
-from jaxgrasp.robustness.chain.formulations import check_vertices, tile_of
-from jaxgrasp.robustness.chain.programs import FORMULATIONS, Basics, basics, scaled_formulation
-from jaxgrasp.robustness.chain.verdicts import Verdict, programs, solved_program, verdict
-from jaxgrasp.robustness.grasps import Grasps, grasps_of, over_grasps
-from jaxgrasp.robustness.interface.arguments import Arguments
+from jaxgrasp.robustness.chain.formulations import check_vertices, choose_tile
+from jaxgrasp.robustness.chain.programs import FORMULATIONS, Basics, compute_basics, scale_formulation
+from jaxgrasp.robustness.chain.verdicts import Decision, decide, select_programs, solve_program
+from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, optional_float
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.arrow import ArrowProblem, build_rows
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
@@ -45,14 +45,14 @@ _SETTINGS = {
         tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=5
     ),
 }
-_ACCEPTED = {"float64": 1e-7, "float32": 1e-3}
-# Wrenches up to this, in units of the mean of f_max.
-_NOTHING = {"float64": 1e-8, "float32": 1e-5}
+_ACCEPTED_GAP = {"float64": 1e-7, "float32": 1e-3}
+# Wrenches up to this, in units of the mean of f_max, are rounding.
+_NO_WRENCH = {"float64": 1e-8, "float32": 1e-5}
 
 
 @record
 class TotalEffortSolution:
-    """What `least_total_effort` answers."""
+    """The result of `least_total_effort`."""
 
     effort: Float[Array, "*batch"]
     """The optimum: 1/2 f_0' Q_0 f_0 + sum_j 1/2 delta f_j' Q delta f_j; NaN where there is no answer."""
@@ -109,15 +109,11 @@ def least_total_effort(
     check_vertices(disturbances)
     if compliance is not None and jnp.shape(compliance)[-3:] != (contacts.n_c, 3, 3):
         raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {contacts.n_c}, 3, 3)")
-    return over_grasps(
-        _TotalEffort(cone_edges, tile_of(contacts, disturbances)),
-        contacts,
-        disturbances,
-        required_wrench=required_wrench,
-        compliance=compliance,
-        effort_weights=effort_weights,
-        margin=margin,
-    )[0]
+    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    options = Options(
+        margin=as_float("margin", margin, ()), effort_weights=optional_float("effort_weights", effort_weights)
+    )
+    return over_grasps(_TotalEffort(cone_edges, choose_tile(contacts, disturbances)), data, options)[0]
 
 
 @dataclass(frozen=True)
@@ -128,9 +124,9 @@ class _TotalEffort(OfPyramids, Audited):
     def stages(self) -> tuple:
         return (
             lambda grasps, _: self._free(grasps),
-            Each({"13": solved_program}),
-            lambda given: self._start(*given),
-            lambda given: self._solve(*given),
+            Each({"13": solve_program}),
+            lambda solved: self._start(*solved),
+            lambda start: self._solve(*start),
         )
 
     def tangents(self, along: Along, out: tuple) -> tuple:
@@ -141,7 +137,7 @@ class _TotalEffort(OfPyramids, Audited):
         return TotalEffortSolution(**changes), jax.tree.map(lambda _: None, record)
 
     def judge(self, arguments: Arguments, out: tuple, anew: bool) -> EffortVerdict:
-        """See `Audited`."""
+        """Hold every lane against the rules of the audit."""
         problem, (solution, record) = problem_of(arguments), out
         assert problem.margin is not None
         wrenches = disturbed_wrenches(problem, jnp.broadcast_to(problem.margin[:, None], solution.changes.shape[:2]))
@@ -149,19 +145,19 @@ class _TotalEffort(OfPyramids, Audited):
         holds = balanced(problem, solution.forces) & admissible(problem, solution.forces, *check)
         holds &= all_hold(problem, disturbed, wrenches, check) & (solution.lower_bound <= solution.effort)
         if anew:
-            grasps = grasps_of(arguments)
+            grasps = admit_all(arguments)
             last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), record)
-            effort, unit = _problem(grasps, basics(grasps, False), self.cone_edges, last.x)
+            effort, unit = _problem(grasps, compute_basics(grasps, False), self.cone_edges, last.x)
             found = effort.objective(last.x), effort.proven(last)
             holds &= least_total_effort_stands(solution.effort, found[1] * unit, found[0] * unit, unit)
         return EffortVerdict((solution.status == Status.SOLVED) & ~holds)
 
     def spot(self, arguments: Arguments, out: tuple) -> jax.Array:
-        """See `Audited`: the program put together anew takes as long to compile as it did at first."""
+        """Nothing: the program put together anew takes as long to compile as it did at first."""
         return jnp.zeros(out[0].effort.shape, bool)
 
     def correct(self, out: tuple, verdicts: EffortVerdict) -> tuple:
-        """See `Audited`."""
+        """Take back what the audit does not confirm."""
         solution, record = out
         changed = {
             f.name: hidden(getattr(solution, f.name), verdicts.failed, jnp.nan)
@@ -172,92 +168,98 @@ class _TotalEffort(OfPyramids, Audited):
         return replace(solution, **changed, status=status), record
 
     def _free(self, grasps: Grasps) -> tuple:
-        shared = basics(grasps, False)
-        scaled = scaled_formulation(grasps, shared, _FREE, self.cone_edges, False)
-        kept = replace(grasps, terms=(), extents=()), shared, scaled.scale
-        return kept, {"13": programs(grasps, shared, scaled, True)}
+        basics = compute_basics(grasps, False)
+        scaled = scale_formulation(grasps, basics, _FREE, self.cone_edges, False)
+        scaled_grasps = replace(grasps, terms=(), extents=()), basics, scaled.scale
+        return scaled_grasps, {"13": select_programs(grasps, basics, scaled, True)}
 
-    def _start(self, kept: tuple, solved: dict[str, ConicOutcome]) -> tuple:
-        grasps, shared, scale = kept
-        found = solved["13"]
-        answer = verdict(grasps, shared, scale, _FREE, found)
+    def _start(self, scaled_grasps: tuple, solved: dict[str, ConicOutcome]) -> tuple:
+        grasps, basics, scale = scaled_grasps
+        outcome = solved["13"]
+        decision = decide(grasps, basics, scale, _FREE, outcome)
         # Each direction on its way from f_0 to the most that it allows: inside the rows.
-        some = answer.answered & jnp.isfinite(answer.directions) & (answer.directions > 0)
-        share = jnp.where(some, grasps.asked / jnp.where(some, answer.directions, 1), 0)
-        x, rest = found.point.x, found.point.x[:, :, -1:]
+        positive = decision.has_margin & jnp.isfinite(decision.directions) & (decision.directions > 0)
+        share = jnp.where(positive, _asked(grasps) / jnp.where(positive, decision.directions, 1), 0)
+        x, rest = outcome.point.x, outcome.point.x[:, :, -1:]
         guess = jnp.concatenate([rest + jnp.clip(share, 0, 1) * (x[:, :, :-1] - rest), rest], 2)
-        return grasps, shared, answer, guess
+        return grasps, basics, decision, guess
 
-    def _solve(self, grasps: Grasps, shared: Basics, answer: Verdict, guess: jax.Array) -> tuple:
-        problem, unit = _problem(grasps, shared, self.cone_edges, guess)
+    def _solve(self, grasps: Grasps, basics: Basics, decision: Decision, guess: jax.Array) -> tuple:
+        problem, unit = _problem(grasps, basics, self.cone_edges, guess)
         dtype = unit.dtype.name
         settings = _SETTINGS[dtype]
-        bearable = answer.answered
-        most = jnp.maximum(jnp.min(answer.upper, 0), jnp.min(answer.directions, 0))
-        active = bearable & (grasps.asked <= most * (1 + settings.tolerance))
-        # Without a load and disturbances no forces at all are the answer. What rounding leaves of nothing counts as
-        # nothing: a grasp that withstands none has no room inside its rows.
-        idle = active & (jnp.abs(problem.rhs) <= _NOTHING[dtype]).all((0, 1))
-        out = interior_point.solve(problem, settings, active & ~idle)
-        record = jax.tree.map(lambda v: jnp.where(idle, 0, v), out.record)
+        bearable = decision.has_margin
+        most = jnp.maximum(jnp.min(decision.upper, 0), jnp.min(decision.directions, 0))
+        active = bearable & (_asked(grasps) <= most * (1 + settings.tolerance))
+        # Without a load and disturbances no forces at all are the optimum. What rounding leaves of no wrench counts as
+        # none: a grasp that withstands none has no room inside its rows.
+        forceless = active & (jnp.abs(problem.rhs) <= _NO_WRENCH[dtype]).all((0, 1))
+        out = interior_point.solve(problem, settings, active & ~forceless)
+        record = jax.tree.map(lambda v: jnp.where(forceless, 0, v), out.record)
         gap = (record.upper - record.lower) / problem.gap_scale(record)
         status = jnp.select(
-            [~grasps.valid, bearable & ~active, ~bearable, gap <= _ACCEPTED[dtype]],
-            [Status.INVALID_INPUT, Status.INFEASIBLE, answer.status, Status.SOLVED],
+            [~grasps.valid, bearable & ~active, ~bearable, gap <= _ACCEPTED_GAP[dtype]],
+            [Status.INVALID_INPUT, Status.INFEASIBLE, decision.status, Status.SOLVED],
             Status.MAX_ITERATIONS,
         ).astype(jnp.int32)
-        answered = active & jnp.isfinite(record.upper)
-        hide = lambda v: jnp.where(answered, v, jnp.nan)
-        forces = jnp.moveaxis(record.x * (shared.sizes * grasps.present)[:, :, None], (2, 1), (0, 1))
+        has_forces = active & jnp.isfinite(record.upper)
+        where_forces = lambda v: jnp.where(has_forces, v, jnp.nan)
+        forces = jnp.moveaxis(record.x * (basics.sizes * grasps.present)[:, :, None], (2, 1), (0, 1))
         solution = TotalEffortSolution(
-            effort=hide(record.upper * unit),
-            lower_bound=hide(record.lower * unit),
-            forces=hide(forces[-1]),
-            changes=hide(forces[:-1] - forces[-1]),
+            effort=where_forces(record.upper * unit),
+            lower_bound=where_forces(record.lower * unit),
+            forces=where_forces(forces[-1]),
+            changes=where_forces(forces[:-1] - forces[-1]),
             status=status,
             iterations=out.iterations,
         )
         return solution, record
 
-    def _adjoint(self, grasps: Grasps, held: tuple, cotangents: tuple, names: frozenset) -> Grasps:
+    def _adjoint(self, grasps: Grasps, held: tuple, cotangents: tuple) -> Grasps:
         solution, record = held
         weight = jnp.where(jnp.isfinite(solution.effort), cotangents[0], 0)
         record = jax.tree.map(lambda x: jnp.where(weight != 0, x, 0), record)
 
         def value(grasps: Grasps) -> jax.Array:
-            problem, unit = _problem(grasps, basics(grasps, False), self.cone_edges, record.x)
+            problem, unit = _problem(grasps, compute_basics(grasps, False), self.cone_edges, record.x)
             return jnp.sum(weight * unit * problem.lagrangian(record))
 
         return jax.grad(value, allow_int=True)(grasps)
 
 
-def _problem(grasps: Grasps, shared: Basics, cone_edges: int, guess: jax.Array) -> tuple[ArrowProblem, jax.Array]:
+def _asked(grasps: Grasps) -> jax.Array:
+    """The margin that is asked for, (*lanes)."""
+    assert grasps.options.margin is not None
+    return grasps.options.margin
+
+
+def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) -> tuple[ArrowProblem, jax.Array]:
     """(11) in scaled forces, and the unit of effort."""
-    dtype, present = shared.sizes.dtype, grasps.present
+    dtype, present, weights = basics.sizes.dtype, grasps.present, grasps.options.effort_weights
     eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[..., None, None], (3, 3, *present.shape))
 
     def scaled(blocks: jax.Array | None) -> jax.Array:
         """D Q D."""
         blocks = eye if blocks is None else blocks
-        return blocks * shared.sizes[:, None] * shared.sizes * present + eye * (1 - present)
+        return blocks * basics.sizes[:, None] * basics.sizes * present + eye * (1 - present)
 
-    own = scaled(None if grasps.weights is None else jnp.moveaxis(grasps.weights, 0, 2))
+    rest = scaled(None if weights is None else jnp.moveaxis(weights, 0, 2))
     change = None
-    if grasps.half is not None:
-        inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.half, grasps.half)
+    if grasps.inverse_root is not None:
+        inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.inverse_root, grasps.inverse_root)
         change = jnp.moveaxis(jnp.linalg.inv(inverse), (0, -2, -1), (2, 0, 1))
     change = scaled(change)
-    largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (own, change)])
+    largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (rest, change)])
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
-    targets = jnp.concatenate([shared.load[:, None] - grasps.asked * shared.targets, shared.load[:, None]], 1)
+    targets = jnp.concatenate([basics.load[:, None] - _asked(grasps) * basics.targets, basics.load[:, None]], 1)
     patterns, h = build_rows(pyramid_facets(cone_edges), dtype, 3)
     problem = ArrowProblem(
         patterns=patterns,
         h=h,
-        columns=shared.columns[:, :, :, None],
+        columns=basics.columns[:, :, :, None],
         rhs=targets,
-        dropped=shared.dropped[:, None],
-        hub_hessian=(own / unit)[:, :, :, None],
+        dropped=basics.dropped[:, None],
+        hub_hessian=(rest / unit)[:, :, :, None],
         copy_hessian=(change / unit)[:, :, :, None],
         guess=guess,
     )

@@ -1,1 +1,1 @@
-"""What callers give and get: arguments laid side by side, sizes of batches, solutions."""
+"""The way in and out: arguments laid side by side, sizes of batches, solutions."""

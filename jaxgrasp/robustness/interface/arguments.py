@@ -1,141 +1,268 @@
-"""The public, batch-first arguments side by side: which leaves have the batch axes, and which all grasps share."""
+"""The data of grasps and the options of a call: checked, and laid side by side as lanes.
+
+`GraspData` says what grasps are, `Options` what a caller asks for. Trees parallel to the two say how a leaf lies: its
+shape without the batch axes, and whether all grasps share it. An option that is a scalar of each grasp needs nothing
+here but its field.
+"""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import Vertices
 
-_CONTACT_LEAVES = ("positions", "frames", "friction", "max_force", "active")
-_PUBLIC = {
-    "wrench": "required_wrench",
-    "reserve": "cone_margin",
-    "per_vertex": "compliance",
-    "weights": "effort_weights",
-}
-# Trailing axes of the leaves of `Actuation`.
-ACTUATION_EVENTS = {"jacobian": 3, "transmission": 2, "inverse": 2, "unreached": 2, "lower": 1, "upper": 1}
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class GraspData:
+    """The data of a batch of grasps; make one with `from_arguments`."""
+
+    contacts: Contacts
+    """The contacts; their dtype is the precision of everything."""
+    disturbances: DisturbanceSet
+    """The set D of disturbances; without batch axes it is shared by all grasps."""
+    required_wrench: Float[Array, "*batch 6"] | None
+    """b, N and N m; None is zero."""
+    compliance: Float[Array, "..."] | Compliance | None
+    """Q as blocks (*batch, contacts, 3, 3) or full (*batch, 3 contacts, 3 contacts), or one for each vertex of the
+    disturbance set; None is the identity."""
+    cone_margin: Float[Array, "*batch"]
+    """d, N: what every facet row keeps in reserve."""
+    actuation: Actuation | None
+    """The limits and transmission of the hand's actuators; None lets every finger push at will."""
+
+    @classmethod
+    def from_arguments(
+        cls,
+        contacts: Contacts,
+        disturbances: DisturbanceSet,
+        required_wrench: ArrayLike | None = None,
+        compliance: ArrayLike | Compliance | None = None,
+        cone_margin: ArrayLike = 0.0,
+        actuation: Actuation | None = None,
+    ) -> "GraspData":
+        """The public arguments of these names, of the right kinds.
+
+        Raises:
+            ValueError: another kind of argument.
+        """
+        if not isinstance(contacts, Contacts):
+            raise ValueError(f"contacts: got {type(contacts).__name__}, wanted jaxgrasp.Contacts")
+        contacts.check_precision()
+        if not isinstance(disturbances, DisturbanceSet):
+            raise ValueError(f"disturbances: got {type(disturbances).__name__}, wanted jaxgrasp.DisturbanceSet")
+        if not isinstance(compliance, Compliance):
+            compliance = optional_float("compliance", compliance)
+        if actuation is not None and not isinstance(actuation, Actuation):
+            raise ValueError(f"actuation: got {type(actuation).__name__}, wanted jaxgrasp.Actuation")
+        if actuation is not None and not actuation.transmission.shape[-1]:
+            raise ValueError("actuation: got no actuators, wanted at least one; leave it out and fingers push at will")
+        return cls(
+            contacts=contacts,
+            disturbances=disturbances,
+            required_wrench=optional_float("required_wrench", required_wrench),
+            compliance=compliance,
+            cone_margin=as_float("cone_margin", cone_margin, ()),
+            actuation=actuation,
+        )
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The wishes of a caller; None where one does not apply."""
+
+    margin: Float[Array, "*batch"] | None = None
+    """lambda that (22) is to give, or that (11) is to withstand."""
+    smoothing: Float[Array, "*batch"] | None = None
+    """kappa of the central point that is asked for in place of the optimum."""
+    cutoff: Float[Array, "*batch"] | None = None
+    """The least margin that is of interest."""
+    effort_weights: Float[Array, "*batch contacts 3 3"] | None = None
+    """Q_0, blocks in contact frames; None is the identity."""
+
+
+def optional_float(name: str, value: ArrayLike | None) -> jax.Array | None:
+    """`as_float` of an argument that may be left out."""
+    return None if value is None else as_float(name, value, ())
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """The public arguments as batched functions take them."""
+
+    data: GraspData
+    """The grasps; the required wrench is always there."""
+    options: Options
+    """The options of the call."""
+    extents: tuple[Float[Array, "*batch 6"], ...]
+    """The largest |w_i| of every term of the disturbance set, N and N m; constants to the derivative."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Public arguments by name.
+    """The public arguments of all grasps as lanes."""
 
-    leaves: (lanes, ...), or without the leading axis where all grasps share them.
-    shared: by name.
-    batch: the batch axes that the lanes stand for.
-    structure: of the disturbance set, whose leaves are named "term 0", "term 1" and so on.
-    """
-
-    leaves: dict[str, jax.Array]
-    shared: dict[str, bool]
+    inputs: Inputs
+    """Leaves (lanes, ...), or without the leading axis where all grasps share them."""
+    shared: Inputs
+    """A bool for each leaf, parallel to `inputs`: whether all grasps share it."""
     batch: tuple[int, ...]
-    structure: Any
-
-    def terms(self, leaves: dict[str, jax.Array]) -> tuple[Term, ...]:
-        """The terms of the disturbance set, from leaves by name."""
-        return jax.tree.unflatten(self.structure, [leaves[f"term {i}"] for i in range(self.structure.num_leaves)]).terms
+    """The batch axes that the lanes stand for."""
 
 
-def laid_out(contacts: Contacts, disturbances: DisturbanceSet, given: dict) -> Arguments:
+@dataclass(frozen=True)
+class Trailing:
+    """The shape of an array without its batch axes; a leaf of trees that are parallel to the arguments."""
+
+    shape: tuple[int, ...]
+
+    def lead(self, array: jax.Array) -> tuple[int, ...]:
+        """The batch axes of an array that ends in this shape."""
+        return array.shape[: array.ndim - len(self.shape)]
+
+
+def trailing_shapes(data: GraspData, options: Options) -> tuple[GraspData, Options]:
+    """The shapes that leaves have to end in, as parallel trees; without those of the disturbance set."""
+    n, batch = data.contacts.n_c, data.contacts.batch_shape
+    alike = lambda tree, shape: jax.tree.map(lambda _: Trailing(shape), tree)
+    actuation: Any = data.actuation
+    if actuation is not None:
+        joints, actuators = actuation.transmission.shape[-2:]
+        actuation = replace(
+            actuation,
+            jacobian=Trailing((n, 3, joints)),
+            transmission=Trailing((joints, actuators)),
+            lower=Trailing((actuators,)),
+            upper=Trailing((actuators,)),
+            inverse=Trailing((actuators, joints)),
+            unreached=jax.tree.map(lambda x: Trailing(x.shape[-2:]), actuation.unreached),
+        )
+    shapes = replace(
+        data,
+        contacts=jax.tree.map(lambda x: Trailing(x.shape[len(batch) :]), data.contacts),
+        disturbances=None,
+        required_wrench=alike(data.required_wrench, (6,)),
+        compliance=_compliance_shape(data),
+        cone_margin=Trailing(()),
+        actuation=actuation,
+    )
+    return shapes, replace(alike(options, ()), effort_weights=alike(options.effort_weights, (n, 3, 3)))
+
+
+def lay_out(data: GraspData, options: Options) -> Arguments:
     """Broadcast all arguments to the batch that they have in common.
-
-    Args:
-        contacts: the grasps; their dtype is the precision of everything.
-        disturbances: the set D.
-        given: the other arguments by their public names, None where not given.
 
     Raises:
         ValueError: shapes that do not fit.
     """
-    required_wrench, compliance, cone_margin = given["required_wrench"], given["compliance"], given["cone_margin"]
-    effort_weights = given["effort_weights"]
-    n = contacts.n_c
-    own = {name: (getattr(contacts, name), contacts.batch_shape) for name in _CONTACT_LEAVES}
-    other: dict[str, tuple[Any, tuple[int, ...]]] = {
-        "wrench": _argument("required_wrench", np.zeros(6) if required_wrench is None else required_wrench, (6,)),
-        "reserve": _argument("cone_margin", cone_margin, ()),
-    }
-    if isinstance(compliance, Compliance):
-        other["per_vertex"] = _per_vertex(compliance, disturbances, n)
-    elif compliance is not None:
-        other["compliance"] = _compliance(compliance, n)
-    if effort_weights is not None:
-        other["weights"] = _argument("effort_weights", effort_weights, (n, 3, 3))
-    for name in ("margin", "smoothing", "cutoff"):
-        if given[name] is not None:
-            other[name] = _argument(name, given[name], ())
-    if given["actuation"] is not None:
-        other |= _actuation(given["actuation"], n)
+    load = np.zeros(6) if data.required_wrench is None else data.required_wrench
+    data = replace(data, required_wrench=as_float("required_wrench", load, (6,)))
+    _check_vertices(data)
+    _check_jacobian(data)
+    shapes, option_shapes = trailing_shapes(data, options)
+    if options.effort_weights is not None:
+        as_float("effort_weights", options.effort_weights, (data.contacts.n_c, 3, 3))
+    disturbances = data.disturbances
     batch = broadcast_batch(
-        contacts=contacts.batch_shape,
+        contacts=data.contacts.batch_shape,
         disturbances=disturbances.batch_shape,
-        **{_PUBLIC.get(name, name): lead for name, (_, lead) in other.items()},
+        **_batches(replace(data, contacts=None, disturbances=None), replace(shapes, contacts=None)),
+        **_batches(options, option_shapes),
     )
-    dtype = contacts.positions.dtype
-    terms, structure = jax.tree.flatten(disturbances.spread_over(batch) if disturbances.batch_shape else disturbances)
-    lead = batch if disturbances.batch_shape else ()
-    spread = jax.tree.unflatten(structure, terms)
-    leaves = {**own, **other, **{f"term {i}": (leaf, lead) for i, leaf in enumerate(terms)}}
-    leaves |= {f"extent {i}": (jax.lax.stop_gradient(term.extent()), lead) for i, term in enumerate(spread.terms)}
+    lead = ()
+    if disturbances.batch_shape:
+        disturbances, lead = disturbances.spread_over(batch), batch
+    inputs = Inputs(
+        data=replace(data, disturbances=disturbances),
+        options=options,
+        extents=tuple(jax.lax.stop_gradient(term.extent()) for term in disturbances.terms),
+    )
+    after = lambda tree: jax.tree.map(lambda x: Trailing(x.shape[len(lead) :]), tree)
+    shapes = Inputs(
+        data=replace(shapes, disturbances=after(disturbances)), options=option_shapes, extents=after(inputs.extents)
+    )
+    shared = jax.tree.map(lambda x, shape: shape.lead(x) == (), inputs, shapes)
+    contacts = jax.tree.map(lambda _: False, data.contacts)
+    shared = replace(shared, data=replace(shared.data, contacts=contacts))
+    dtype = data.contacts.positions.dtype
 
-    arguments, shared = {}, {}
-    for name, (leaf, lead) in leaves.items():
+    def lay(leaf: jax.Array, shape: Trailing, is_shared: bool) -> jax.Array:
         leaf = leaf if leaf.dtype == bool else leaf.astype(dtype)
-        shared[name] = not lead and name not in own
-        if not shared[name]:
-            event = leaf.shape[len(lead) :]
-            leaf = jnp.broadcast_to(leaf, (*batch, *event)).reshape(math.prod(batch), *event)
-        arguments[name] = leaf
-    return Arguments(arguments, shared, batch, structure)
+        if is_shared:
+            return leaf
+        return jnp.broadcast_to(leaf, (*batch, *shape.shape)).reshape(math.prod(batch), *shape.shape)
+
+    return Arguments(jax.tree.map(lay, inputs, shapes, shared), shared, batch)
 
 
-def _argument(name: str, value: Any, event: tuple[int, ...]) -> tuple[jax.Array, tuple[int, ...]]:
-    array = as_float(name, value, event)
-    return array, array.shape[: array.ndim - len(event)]
+def _batches(tree: Any, shapes: Any) -> dict[str, tuple[int, ...]]:
+    """The batch axes of all leaves, by their public names."""
+    leaves, ends = jax.tree_util.tree_flatten_with_path(tree)[0], jax.tree.leaves(shapes)
+    name = lambda path: jax.tree_util.keystr(path, simple=True, separator=".")
+    return {name(path): end.lead(leaf) for (path, leaf), end in zip(leaves, ends, strict=True)}
 
 
-def _compliance(value: Any, n: int) -> tuple[jax.Array, tuple[int, ...]]:
-    array = as_float("compliance", value, ("rows", "columns"))
-    for event in ((n, 3, 3), (3 * n, 3 * n)):
-        if array.shape[-len(event) :] == event:
-            return array, array.shape[: array.ndim - len(event)]
-    raise ValueError(f"compliance: got shape {array.shape}, wanted (*batch, {n}, 3, 3) or (*batch, {3 * n}, {3 * n})")
-
-
-def _per_vertex(compliance: Compliance, disturbances: DisturbanceSet, n: int) -> tuple[jax.Array, tuple[int, ...]]:
-    if len(disturbances.terms) != 1 or not isinstance(disturbances.terms[0], Vertices):
+def _check_vertices(data: GraspData) -> None:
+    """Refuse one Q for each direction where the set does not consist of directions."""
+    if not isinstance(data.compliance, Compliance):
+        return
+    terms = data.disturbances.terms
+    if len(terms) != 1 or not isinstance(terms[0], Vertices):
         raise ValueError(
             "compliance: got one Q for each direction, wanted a single Q, "
             "since the disturbance set is not given by vertices; use DisturbanceSet.vertices"
         )
-    if disturbances.terms[0].width is not None:
+    if terms[0].width is not None:
         raise ValueError("compliance: got one Q for each direction, wanted a single Q, since the set is smoothed")
-    array, count = compliance.per_vertex, disturbances.terms[0].wrenches.shape[-2]
-    for event in ((count, n, 3, 3), (count, 3 * n, 3 * n)):
-        if array.shape[-len(event) :] == event:
-            return array, array.shape[: array.ndim - len(event)]
-    raise ValueError(
-        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or "
-        f"(*batch, {count}, {3 * n}, {3 * n}), one Q for each of the {count} wrenches"
-    )
 
 
-def _actuation(actuation: Actuation, n: int) -> dict[str, tuple[jax.Array, tuple[int, ...]]]:
-    if actuation.jacobian.shape[-3] != n:
+def _check_jacobian(data: GraspData) -> None:
+    """Refuse an actuation for another number of contacts."""
+    n, actuation = data.contacts.n_c, data.actuation
+    if actuation is not None and actuation.jacobian.shape[-3] != n:
         raise ValueError(
             f"actuation: got a jacobian of shape {actuation.jacobian.shape}, wanted (*batch, {n}, 3, n_v), "
             f"one for each of the {n} contacts"
         )
-    leaves = {name: getattr(actuation, name) for name in ACTUATION_EVENTS}
-    return {name: (x, x.shape[: x.ndim - ACTUATION_EVENTS[name]]) for name, x in leaves.items() if x is not None}
+
+
+def _compliance_shape(data: GraspData) -> Any:
+    """The shape that Q has to end in, parallel to the compliance: blocks of contacts, or all contacts together.
+
+    Raises:
+        ValueError: it ends in neither.
+    """
+    n, compliance = data.contacts.n_c, data.compliance
+    if compliance is None:
+        return None
+    if not isinstance(compliance, Compliance):
+        array = as_float("compliance", compliance, ("rows", "columns"))
+        for shape in ((n, 3, 3), (3 * n, 3 * n)):
+            if array.shape[-len(shape) :] == shape:
+                return Trailing(shape)
+        raise ValueError(
+            f"compliance: got shape {array.shape}, wanted (*batch, {n}, 3, 3) or (*batch, {3 * n}, {3 * n})"
+        )
+    (vertices,) = data.disturbances.terms
+    assert isinstance(vertices, Vertices)
+    array, count = compliance.per_vertex, vertices.wrenches.shape[-2]
+    for shape in ((count, n, 3, 3), (count, 3 * n, 3 * n)):
+        if array.shape[-len(shape) :] == shape:
+            return replace(compliance, per_vertex=Trailing(shape))
+    raise ValueError(
+        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or "
+        f"(*batch, {count}, {3 * n}, {3 * n}), one Q for each of the {count} wrenches"
+    )

@@ -1,4 +1,4 @@
-"""What (21) and (22) answer."""
+"""The solutions of (21) and (22)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int

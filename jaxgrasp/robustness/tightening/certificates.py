@@ -1,8 +1,8 @@
-"""What the solver's best points are worth in the equality rows as they came, before these were made orthonormal.
+"""What the solver's best points are worth in the original equality rows, before these were made orthonormal.
 
 The solver works with E = T N, orthonormal combinations of the rows N of G (and of J'f - B u). In floating point E is
 off T N by about eps over what was left of the shortest row, which the solver cannot see. So in the end points are moved
-onto N x = b itself, and with w = T'y the upper bound is taken anew,
+onto N x = b itself, and with w = T'y the upper bound is computed anew,
 
     lambda* <= [h'z + b'w + radius |A'z + N'w|_1 + e] / sigma'z,
 
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced
-from jaxgrasp.robustness.tightening.program import Program
+from jaxgrasp.robustness.tightening.program import ScaledProgram
 from jaxgrasp.solvers.block.kkt import BlockProblem, Record, Rows, adjoint_rows, total
 
 # The largest share of the larger of |b| and sum |f_i| that G f may miss b by in float32.
@@ -29,7 +29,7 @@ _EXACT = 1e-5
 
 
 class Forces(NamedTuple):
-    """Unknowns that meet the equality rows as they came.
+    """Unknowns that meet the original equality rows.
 
     x: the point.
     exact: bool (*lanes), G f misses b by no more than rounding, in the rows that were dropped, too.
@@ -39,15 +39,15 @@ class Forces(NamedTuple):
     exact: jax.Array
 
 
-def balanced(program: Program, problem: BlockProblem, x: Rows) -> Forces:
-    """The nearest point on N x = b."""
-    given, basis = program.given, program.basis
-    if given.wrench.dtype == jnp.float64:
+def balance(program: ScaledProgram, problem: BlockProblem, x: Rows) -> Forces:
+    """Move a point onto N x = b, to the nearest one."""
+    original, basis = program.original, program.basis
+    if original.wrench.dtype == jnp.float64:
         return Forces(x, jnp.ones(problem.lanes, bool))
 
     @fenced
     def lacking(x: Rows) -> tuple[jax.Array, jax.Array]:
-        gap = basis.coordinates(given.wrench - given.equality(x))
+        gap = basis.coordinates(original.wrench - original.equality(x))
         return gap * basis.kept, fold(jnp.maximum, jnp.abs(gap[:6] * (1 - basis.kept[:6])))
 
     @fenced
@@ -56,23 +56,23 @@ def balanced(program: Program, problem: BlockProblem, x: Rows) -> Forces:
 
     gap, missed = lacking(x)
     x = move(x, gap)
-    load = fold(jnp.maximum, jnp.abs(given.wrench))
+    load = fold(jnp.maximum, jnp.abs(original.wrench))
     applied = fold(jnp.add, fold(jnp.add, jnp.abs(program.forces(x[0])))) / program.mean
     return Forces(x, missed <= _EXACT * jnp.maximum(load, applied / 2))
 
 
-def certified(program: Program, problem: BlockProblem, record: Record) -> jax.Array:
-    """The upper bound that the record's multipliers prove, rounding included, (*lanes)."""
+def certify(program: ScaledProgram, problem: BlockProblem, record: Record) -> jax.Array:
+    """Find the upper bound that the record's multipliers prove, rounding included, (*lanes)."""
     if record.upper.dtype == jnp.float64:
         return record.upper
-    given, eps = program.given, jnp.finfo(record.upper.dtype).eps
+    original, eps = program.original, jnp.finfo(record.upper.dtype).eps
     w = program.row_multipliers(record.y)
 
     @fenced
     def sums(z: Rows, w: jax.Array) -> tuple:
-        value, pull, lost, sizes, felt = [fold(jnp.add, given.wrench * w)], [], [], [], []
-        sizes.append(fold(jnp.add, jnp.abs(given.wrench * w)))
-        for group, z_g, column in zip(problem.groups, z, given.columns, strict=True):
+        value, pull, lost, sizes, felt = [fold(jnp.add, original.wrench * w)], [], [], [], []
+        sizes.append(fold(jnp.add, jnp.abs(original.wrench * w)))
+        for group, z_g, column in zip(problem.groups, z, original.columns, strict=True):
             products = column * w[:, None, None]
             value.append(total(group.h * z_g))
             sizes.append(total(jnp.abs(group.h * z_g)))

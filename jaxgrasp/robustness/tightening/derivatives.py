@@ -1,15 +1,37 @@
-"""How the answers of (21) and (22) vary with everything that they depend on.
+"""How the results of (21) and (22) vary with everything that they depend on.
 
 The margin of (21) by the envelope theorem: d margin is the partial derivative of the Lagrangian
 
-    lambda - z_1'(C f_0 - S_1 lambda + d) - z_2'(-E f_0 + S_2 lambda - f_max) - y'(G f_0 - b)
+    lambda - z_1'(C f - S_1 lambda + d) - z_2'(-E f + S_2 lambda - f_max) - y'(G f - b)
 
-with forces, margin and multipliers held: no linear system is solved, and the margin may be negative. Everything else,
-and the margin itself where smoothing is asked for, by the implicit function theorem at a central point, see
-`sensitivity`.
+with forces, margin and multipliers held. No linear system is solved, and the margin may be negative.
+
+Everything else, and the margin itself where smoothing is asked for, by the implicit function theorem at a central point
+u = (x, lambda, y, z), where F(u, data) = 0: F is the gradient of the Lagrangian
+
+    L = objective + y'(E x - b) + sum_i z_i (a_i'x + sigma_i lambda - h_i)
+
+with respect to u, but for kappa / z_i in the rows, which no data enter. K = dF/du is the symmetric matrix of
+`solvers.block.sensitivity`, so a cotangent c of u becomes
+
+    c'du = -m'dF,   K m = c,
+
+with dF taken at u held. As F is a gradient, m'F is the derivative of L along m: a row r_i = a_i'x + sigma_i lambda -
+h_i adds m_z r_i + z_i (a_i'm_x + sigma_i m_lambda), the equalities add m_y'(E x - b) + y'E m_x, and the objective of
+(22) adds m_x'H x. From this follow the cotangents of the data, `RowWeights`:
+
+    row value      -m_z                          sigma    -(m_z lambda + z m_lambda)
+    b               m_y                          G        -(y m_x' + m_y x')
+    Q_0            -1/2 (x m_x' + m_x x')        mu       -(m_z f_n + z m_n) times the facet's share of mu f_n
+
+and (22)'s lambda, which is data there, gets -m_z'sigma. `reach_adjoint` takes S_1 and S_2 back to the grasps.
+
+Without actuators both are written out and can be native kernels. JAX's transpose of the scaled program has operations
+that kernels do not know: with it 16,384 margins and their gradients took 10.4 (float64) and 9.4 (float32) times as
+long. With actuators it is used all the same.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -21,50 +43,21 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.lanes.differentiable import Along, OfPyramids
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.program import (
-    Program,
-    actuated_values,
-    effort_of,
-    effort_problem,
-    margin_problem,
-    prepared,
-    scaled_program,
-    weighed,
-)
+from jaxgrasp.robustness.tightening.objectives import LargestMargin, LeastEffort, Objective, apply_weights
+from jaxgrasp.robustness.tightening.points import Point, build_point, central_kappa, find_central_point, scale_point
+from jaxgrasp.robustness.tightening.program import ScaledProgram, prepare, scale_program
 from jaxgrasp.robustness.worst_case import reach_adjoint
-from jaxgrasp.solvers.block.kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows, total
-from jaxgrasp.solvers.block.sensitivity import central_point, solve_symmetric
+from jaxgrasp.solvers.block.kkt import BlockProblem, total
+from jaxgrasp.solvers.block.sensitivity import solve_symmetric
 from jaxgrasp.solvers.interior_point import Iterate, reduce_rows
-
-# kappa of the central points whose derivatives stand for those of the exact forces of (21) and of (22), in the solver's
-# units, and the largest residual with which they count as found. Of (21) many forces may be optimal, and what tells
-# them apart has a share of kappa^2: below 1e-6 rounding is felt.
-_KAPPA = {"float64": (1e-6, 1e-8), "float32": (1e-4, 1e-5)}
-_FOUND = {"float64": 1e-9, "float32": 1e-4}
-
-
-class Point(NamedTuple):
-    """A point of (21) or (22) with multipliers, in newtons and metres as in `Solution`; lanes trail or lead."""
-
-    margin: jax.Array
-    forces: jax.Array
-    effort: jax.Array
-    cone_multipliers: jax.Array
-    bound_multipliers: jax.Array
-    wrench_multipliers: jax.Array
-    usable: jax.Array
-    """bool (*lanes): where it is one."""
-    actuator_efforts: jax.Array | None = None
-    actuator_multipliers: jax.Array | None = None
-    joint_multipliers: jax.Array | None = None
 
 
 class RowWeights(NamedTuple):
-    """What a cotangent asks of the rows: of C f + h lambda + d and -f_n + h lambda - f_max, with h = -S_1 or S_2.
+    """Cotangents of what the rows C f + h lambda + d <= 0 and -f_n + h lambda - f_max <= 0 are made of, h = -S_1, S_2.
 
     cone, bound: (n_e, n, *lanes) and (n, *lanes), of the rows' values.
-    cone_reach, bound_reach: the same, of h.
-    friction: (n, *lanes).
+    cone_reach, bound_reach: of h, in the same shapes.
+    friction: (n, *lanes), of mu in C.
     columns: (6, 3, n, *lanes), of the blocks of G, moments as in `Grasps`.
     wrench: (6, *lanes), of b.
     weights: (n, 3, 3, *lanes), of Q_0; None where there is none.
@@ -82,16 +75,16 @@ class RowWeights(NamedTuple):
     margin: jax.Array | None = None
 
 
-def envelope_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: tuple, names: frozenset) -> Grasps:
-    """The gradient of (21)'s Lagrangian with respect to the data, times a cotangent (*lanes)."""
+def envelope_adjoint(cone_edges: int, with_terms: bool, grasps: Grasps, point: Point, cotangents: tuple) -> Grasps:
+    """Find the gradient of (21)'s Lagrangian with respect to the data, times the cotangent (*lanes) of the margin."""
     weight = jnp.where(point.usable, cotangents[0], 0)
     if grasps.actuated is not None:
         return _lagrangian_gradient(cone_edges, grasps, point, weight)
-    clean = lambda x: jnp.where(point.usable, x, 0)
-    force, z_cone = clean(jnp.moveaxis(point.forces, 1, 0)), clean(jnp.moveaxis(point.cone_multipliers, 1, 0))
-    z_cone, z_bound = -z_cone * weight * grasps.present, -clean(point.bound_multipliers) * weight * grasps.present
-    y = clean(point.wrench_multipliers) * weight
-    margin = clean(point.margin)
+    usable = lambda x: jnp.where(point.usable, x, 0)
+    force, z_cone = usable(jnp.moveaxis(point.forces, 1, 0)), usable(jnp.moveaxis(point.cone_multipliers, 1, 0))
+    z_cone, z_bound = -z_cone * weight * grasps.present, -usable(point.bound_multipliers) * weight * grasps.present
+    y = usable(point.wrench_multipliers) * weight
+    margin = usable(point.margin)
     normal = literal(pyramid_facets(cone_edges)[:, 2], force.dtype)[:, None, None]
     rows = RowWeights(
         cone=z_cone,
@@ -102,23 +95,23 @@ def envelope_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
         columns=-(y / grasps.units)[:, None, None] * force,
         wrench=y / grasps.units,
     )
-    return _to_grasps(grasps, rows, cone_edges, names)
+    return _to_grasps(grasps, rows, cone_edges, with_terms)
 
 
-def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, names: frozenset) -> Grasps:
-    """Cotangents of the data, from those of the rows."""
-    zero = jax.tree.map(_nothing, grasps)
-    columns, friction, half, terms = reach_adjoint(
-        grasps, rows.cone_reach, rows.bound_reach, cone_edges, any(name.startswith("term") for name in names)
+def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, with_terms: bool) -> Grasps:
+    """Turn cotangents of the rows into those of the data."""
+    zero = jax.tree.map(_zero_cotangent, grasps)
+    columns, friction, inverse_root, terms = reach_adjoint(
+        grasps, rows.cone_reach, rows.bound_reach, cone_edges, with_terms
     )
-    if grasps.vertex_halves is not None:
-        zero = replace(zero, vertex_halves=half)
-    elif grasps.half is not None:
-        zero = replace(zero, half=half)
+    if grasps.vertex_inverse_roots is not None:
+        zero = replace(zero, vertex_inverse_roots=inverse_root)
+    elif grasps.inverse_root is not None:
+        zero = replace(zero, inverse_root=inverse_root)
     if rows.weights is not None:
-        zero = replace(zero, weights=rows.weights)
+        zero = replace(zero, options=replace(zero.options, effort_weights=rows.weights))
     if rows.margin is not None:
-        zero = replace(zero, margin=rows.margin)
+        zero = replace(zero, options=replace(zero.options, margin=rows.margin))
     return replace(
         zero,
         friction=rows.friction + friction,
@@ -130,77 +123,92 @@ def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, names: frozens
     )
 
 
-def _nothing(x: jax.Array) -> jax.Array | np.ndarray:
+def _zero_cotangent(x: jax.Array) -> jax.Array | np.ndarray:
     return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
 
 
+@dataclass(frozen=True)
 class CentralPoint(OfPyramids):
-    """The kernel that finds the central point next to a point of (21) or, where a margin is asked for, of (22)."""
+    """The function that finds the central point next to a point of (21) or (22)."""
+
+    objective: Objective
+    """Which of the two programs it is."""
 
     @property
     def stages(self) -> tuple:
-        """See `Kernel`; the point is held."""
-        return (lambda grasps, point: (*prepared(grasps, self.cone_edges), point), lambda given: self._find(*given))
+        """Scale the grasps, then find the point next to the one that is held."""
+        return (lambda grasps, point: (*prepare(grasps, self.cone_edges), point), lambda scaled: self._find(*scaled))
 
-    def _find(self, grasps: Grasps, program: Program, point: Point) -> Point:
-        problem, unit = _problem(grasps, program)
-        return centred(grasps, program, _iterate(problem, program, point, unit, None), point.usable)
+    def _find(self, grasps: Grasps, program: ScaledProgram, point: Point) -> Point:
+        problem, unit = self.objective.problem(grasps, program)
+        start = scale_point(problem, program, point, unit, None)
+        return find_central_point(self.objective, grasps, program, start, point.usable)
 
     def tangents(self, along: Along, out: Point) -> Point:
-        """See `Kernel`."""
-        return along.adjoint(partial(_central_adjoint, self.cone_edges), out, out._replace(usable=None))
+        """The derivative by the implicit function theorem."""
+        adjoint = partial(_central_adjoint, self.objective, self.cone_edges, set_changes(along))
+        return along.adjoint(adjoint, out, out._replace(usable=None), is_compact(along))
 
 
-def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: Point, names: frozenset) -> Grasps:
-    """From cotangents of a central point to those of the data: one solve with the symmetric matrix."""
+def set_changes(along: Along) -> bool:
+    """Whether the disturbance set changes."""
+    return bool(jax.tree.leaves(along.changes.data.disturbances))
+
+
+def is_compact(along: Along) -> bool:
+    """Whether the adjoints below are free of library calls and large reductions, see `Along.adjoint`.
+
+    With respect to the disturbance set there are reductions, and what comes with actuators is JAX's own transpose.
+    """
+    return along.arguments.data.actuation is None and not set_changes(along)
+
+
+class _Units(NamedTuple):
+    """Units of the solver in newtons: of forces (3, n, *lanes), of rows (n_e + 1, n, *lanes), of the objective."""
+
+    forces: jax.Array
+    rows: jax.Array
+    objective: jax.Array
+
+
+def _central_adjoint(
+    objective: Objective, cone_edges: int, with_terms: bool, grasps: Grasps, point: Point, cotangents: Point
+) -> Grasps:
+    """Turn cotangents of a central point into those of the data, by one solve with the symmetric matrix."""
     if grasps.actuated is not None:
-        return _actuated_adjoint(cone_edges, grasps, point, cotangents)
-    program = scaled_program(grasps, cone_edges)
-    problem, unit = _problem(grasps, program)
-    (group,), kappa = problem.groups, central_kappa(grasps, program, unit)
-    iterate = _iterate(problem, program, point, unit, kappa)
-    (z,), (s,) = iterate.z, iterate.s
+        return _actuated_adjoint(objective, cone_edges, grasps, point, cotangents)
+    program = scale_program(grasps, cone_edges)
+    problem, unit = objective.problem(grasps, program)
+    iterate = scale_point(problem, program, point, unit, central_kappa(objective, grasps, unit))
+    where_usable = lambda x: None if x is None else jnp.where(point.usable, x, 0)
     forces = jnp.where(point.usable, point.forces, 0)
     scales = jnp.stack([program.tangential, program.tangential, program.normal])
-    row_units = program.row_units()
-    given = lambda ct: None if ct is None else jnp.where(point.usable, ct, 0)
-    ct = cotangents._replace(**{name: given(part) for name, part in cotangents._asdict().items()})
+    units = _Units(scales, program.row_units(), unit)
+    ct = cotangents._replace(**{name: where_usable(part) for name, part in cotangents._asdict().items()})
 
-    pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
-    effort_weights = None
-    if ct.effort is not None:
-        pull = pull + ct.effort * weighed(forces, grasps.weights)
-        effort_weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
-    right_x = jnp.moveaxis(pull, 1, 0) * scales * grasps.present
-    cone = jnp.zeros_like(z[:-1]) if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)
-    bound = jnp.zeros_like(z[-1]) if ct.bound_multipliers is None else ct.bound_multipliers
-    right_z = jnp.concatenate([cone, bound[None]]) * unit / row_units * grasps.present
-    right_y, right_lambda = jnp.zeros_like(problem.rhs), None
-    if ct.wrench_multipliers is not None:
-        right_y = program.wrench_multipliers_adjoint(ct.wrench_multipliers, grasps.units) * unit
-    if problem.bordered:
-        right_lambda = jnp.zeros_like(unit) if ct.margin is None else ct.margin * program.scale
-    right = ((right_x,), right_lambda, right_y, (right_z,))
-    (move_x,), move_lambda, move_y, (values,) = solve_symmetric(problem, (s,), (z,), right)
+    # K m = c.
+    right, weights = _right_side(problem, program, grasps, forces, ct, units)
+    (move_x,), move_lambda, move_y, (move_z,) = solve_symmetric(problem, iterate.s, iterate.z, right)
 
-    # Back in newtons: forces, margin, and multipliers for an objective in the solver's unit.
-    values = -values * grasps.present / row_units
-    z = z / row_units
+    # -m'dF: m and the point back in newtons, multipliers for an objective in the solver's unit.
+    values = -move_z * grasps.present / units.rows
+    z = iterate.z[0] / units.rows
     margin = jnp.where(point.usable, point.margin, 0)
     reach = values * margin
     if move_lambda is not None:
         reach = reach - z * (move_lambda * program.scale)
-    force, move = jnp.moveaxis(forces, 1, 0), move_x * scales
+    force, move = jnp.moveaxis(forces, 1, 0), move_x * units.forces
     y = jnp.where(point.usable, point.wrench_multipliers, 0) / grasps.units / unit
     move_y = program.wrench_multipliers(move_y, jnp.ones_like(grasps.units))
     normal = literal(pyramid_facets(cone_edges)[:, 2], z.dtype)[:, None, None]
     asked = None
-    if grasps.margin is not None:
-        asked = total(values * group.sigma * row_units) / program.scale
+    if isinstance(objective, LeastEffort):
+        # lambda is data, and H = Q_0 / unit in the stationarity of f.
+        asked = total(values * problem.groups[0].sigma * units.rows) / program.scale
         asked = asked if ct.margin is None else asked + ct.margin
         bend = -0.5 / unit * (force[:, None] * move + move[:, None] * force)
         bend = jnp.moveaxis(bend, 2, 0)
-        effort_weights = bend if effort_weights is None else bend + effort_weights
+        weights = bend if weights is None else bend + weights
     rows = RowWeights(
         cone=values[:-1],
         bound=values[-1],
@@ -209,20 +217,44 @@ def _central_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: 
         friction=fold(jnp.add, normal * (values[:-1] * force[2] - z[:-1] * move[2])),
         columns=-(y[:, None, None] * move + move_y[:, None, None] * force),
         wrench=move_y,
-        weights=None if grasps.weights is None else effort_weights,
+        weights=None if grasps.options.effort_weights is None else weights,
         margin=asked,
     )
-    return _to_grasps(grasps, rows, cone_edges, names)
+    return _to_grasps(grasps, rows, cone_edges, with_terms)
+
+
+def _right_side(
+    problem: BlockProblem, program: ScaledProgram, grasps: Grasps, forces: jax.Array, ct: Point, units: _Units
+) -> tuple[tuple, jax.Array | None]:
+    """The cotangent c of the scaled (x, lambda, y, z), and what the effort's asks of Q_0 itself, (n, 3, 3, *lanes)."""
+    (group,) = problem.groups
+    pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
+    weights = None
+    if ct.effort is not None:
+        pull = pull + ct.effort * apply_weights(forces, grasps.options.effort_weights)
+        weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
+    right_x = jnp.moveaxis(pull, 1, 0) * units.forces * grasps.present
+    none = jnp.zeros_like(group.h)
+    cone = none[:-1] if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)
+    bound = none[-1] if ct.bound_multipliers is None else ct.bound_multipliers
+    right_z = jnp.concatenate([cone, bound[None]]) * units.objective / units.rows * grasps.present
+    right_y, right_lambda = jnp.zeros_like(problem.rhs), None
+    if ct.wrench_multipliers is not None:
+        right_y = program.wrench_multipliers_adjoint(ct.wrench_multipliers, grasps.units) * units.objective
+    if problem.bordered:
+        right_lambda = jnp.zeros_like(units.objective) if ct.margin is None else ct.margin * program.scale
+    return ((right_x,), right_lambda, right_y, (right_z,)), weights
 
 
 def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: jax.Array) -> Grasps:
-    """`envelope_adjoint` for a hand, through the scaled program by JAX's own hand."""
-    program = scaled_program(grasps, cone_edges)
-    problem, unit = _problem(grasps, program)
-    iterate = _iterate(problem, program, point, unit, None)
+    """`envelope_adjoint` for a hand with actuators: JAX differentiates the Lagrangian of the scaled program."""
+    program = scale_program(grasps, cone_edges)
+    objective = LargestMargin()
+    problem, unit = objective.problem(grasps, program)
+    iterate = scale_point(problem, program, point, unit, None)
 
     def value(grasps: Grasps) -> jax.Array:
-        moved = _problem(grasps, scaled_program(grasps, cone_edges))[0]
+        moved = objective.problem(grasps, scale_program(grasps, cone_edges))[0]
         residuals = moved.residuals(iterate)
         terms = jax.tree.map(jnp.multiply, (iterate.z, iterate.y), (residuals.rows, residuals.primal))
         return -jnp.sum(weight * unit * reduce_rows(jnp.add, terms, weight.ndim))
@@ -230,97 +262,30 @@ def _lagrangian_gradient(cone_edges: int, grasps: Grasps, point: Point, weight: 
     return jax.grad(value, allow_int=True)(grasps)
 
 
-def _actuated_adjoint(cone_edges: int, grasps: Grasps, point: Point, cotangents: Point) -> Grasps:
-    """`_central_adjoint` for a hand, through the scaled program by JAX's own hand."""
-    program = scaled_program(grasps, cone_edges)
-    problem, unit = _problem(grasps, program)
-    iterate = _iterate(problem, program, point, unit, central_kappa(grasps, program, unit))
+def _actuated_adjoint(objective: Objective, cone_edges: int, grasps: Grasps, point: Point, cotangents: Point) -> Grasps:
+    """`_central_adjoint` for a hand with actuators: JAX differentiates m'F of the scaled program."""
+    program = scale_program(grasps, cone_edges)
+    problem, unit = objective.problem(grasps, program)
+    iterate = scale_point(problem, program, point, unit, central_kappa(objective, grasps, unit))
 
     def read(grasps: Grasps, iterate: Iterate) -> Point:
-        return _point(grasps, scaled_program(grasps, cone_edges), iterate, unit, point.usable)._replace(usable=None)
+        moved = build_point(objective, grasps, scale_program(grasps, cone_edges), iterate, unit, point.usable)
+        return moved._replace(usable=None)
 
     out, pull = jax.vjp(read, grasps, iterate)
-    given = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)
-    known = {name: given(getattr(cotangents, name), like) for name, like in out._asdict().items() if like is not None}
-    direct, back = pull(out._replace(**known))
+    usable = lambda ct, like: jnp.zeros_like(like) if ct is None else jnp.where(point.usable, ct, 0)
+    ct = {name: usable(getattr(cotangents, name), like) for name, like in out._asdict().items() if like is not None}
+    direct, back = pull(out._replace(**ct))
     right_x, right_lambda = back.x if problem.bordered else (back.x, None)
     move_x, move_lambda, move_y, move_z = solve_symmetric(
         problem, iterate.s, iterate.z, (right_x, right_lambda, back.y, back.z)
     )
     moves = ((move_x, move_lambda) if problem.bordered else move_x, move_y, move_z)
 
-    def lack(grasps: Grasps) -> jax.Array:
-        residuals = _problem(grasps, scaled_program(grasps, cone_edges))[0].residuals(iterate)
+    def along_moves(grasps: Grasps) -> jax.Array:
+        residuals = objective.problem(grasps, scale_program(grasps, cone_edges))[0].residuals(iterate)
         terms = jax.tree.map(jnp.multiply, moves, (residuals.dual, residuals.primal, residuals.rows))
         return -jnp.sum(jnp.where(point.usable, reduce_rows(jnp.add, terms, unit.ndim), 0))
 
-    indirect = jax.grad(lack, allow_int=True)(grasps)
+    indirect = jax.grad(along_moves, allow_int=True)(grasps)
     return jax.tree.map(lambda a, b: a if a.dtype == jax.dtypes.float0 else a + b, direct, indirect)
-
-
-def central_kappa(grasps: Grasps, program: Program, unit: jax.Array) -> jax.Array:
-    """What s z is at the central point, scaled, (*lanes), for an objective in the given unit."""
-    if grasps.smoothing is not None:
-        return grasps.smoothing / unit
-    return jnp.full_like(program.scale, _KAPPA[program.scale.dtype.name][grasps.margin is not None])
-
-
-def centred(grasps: Grasps, program: Program, start: Iterate, active: jax.Array) -> Point:
-    """The central point that Newton's method finds from a start near by."""
-    problem, unit = _problem(grasps, program)
-    kappa = central_kappa(grasps, program, unit)
-    centre = central_point(problem, start, kappa, active)
-    found = active & (centre.error <= _FOUND[kappa.dtype.name])
-    return _point(grasps, program, centre.iterate, unit, found)
-
-
-def _problem(grasps: Grasps, program: Program) -> tuple[BlockProblem, jax.Array]:
-    """The problem, and what its objective is measured in."""
-    if grasps.margin is None:
-        return margin_problem(program), program.scale
-    effort = effort_problem(grasps, program)
-    return effort.problem, effort.unit**2
-
-
-def _point(grasps: Grasps, program: Program, iterate: Iterate, unit: jax.Array, usable: jax.Array) -> Point:
-    blocks, margin = (iterate.x, grasps.margin) if grasps.margin is not None else iterate.x
-    forces = program.forces(blocks[0]) * grasps.present[:, None]
-    multipliers = iterate.z[0] * unit / program.row_units()
-    actuated = actuated_values(program, blocks, iterate, grasps.units, unit)
-    return Point(
-        margin=margin if grasps.margin is not None else margin * program.scale,
-        forces=forces,
-        effort=effort_of(forces, grasps.weights),
-        cone_multipliers=jnp.moveaxis(multipliers[:-1], 0, 1),
-        bound_multipliers=multipliers[-1],
-        wrench_multipliers=program.wrench_multipliers(iterate.y, grasps.units) * unit,
-        usable=usable,
-        **actuated,
-    )
-
-
-def _iterate(
-    problem: BlockProblem, program: Program, point: Point, unit: jax.Array, kappa: jax.Array | None
-) -> Iterate:
-    """The scaled iterate; s from s z = kappa, or from the rows where kappa is None. Harmless where of no use."""
-    clean = lambda x, other: jnp.where(point.usable, x, other)
-    forces = clean(jnp.moveaxis(point.forces, 1, 0), 0) * program.present
-    x = [forces / jnp.stack([program.tangential, program.tangential, program.normal])]
-    z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
-    z = [clean(z * program.row_units() / unit, 1) * program.present]
-    if program.efforts is not None:
-        assert point.actuator_multipliers is not None
-        x.append((clean(point.actuator_efforts, 0) / program.efforts.unit)[None])
-        z.append(clean(jnp.moveaxis(point.actuator_multipliers, 1, 0) * program.efforts.unit / unit, 1))
-    lam = clean(point.margin, 0) / program.scale
-    s, pull = [], []
-    for group, x_g, z_g in zip(problem.groups, x, z, strict=True):
-        if kappa is None:
-            slack = group.h - apply_rows(group, x_g) - (group.sigma * lam if problem.bordered else 0)
-        else:
-            slack = kappa / jnp.where(group.present > 0, z_g, 1)
-        s.append(jnp.where(group.present > 0, clean(slack, 1), 1))
-        stationary = adjoint_rows(group, z_g)
-        pull.append(stationary if group.hessian_root is None else stationary + apply_hessian(group, x_g))
-    blocks, y = tuple(x), -problem.equality(tuple(pull))
-    return Iterate((blocks, lam) if problem.bordered else blocks, y, tuple(s), tuple(z))

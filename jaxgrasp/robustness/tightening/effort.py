@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from jaxgrasp.arrays import as_float
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
@@ -14,10 +15,12 @@ from jaxgrasp.lanes.differentiable import Along
 from jaxgrasp.robustness.auditing.pyramids import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.decisions import solve_effort, solve_margin
-from jaxgrasp.robustness.tightening.kernel import Tightening, changed
-from jaxgrasp.robustness.tightening.program import Program
+from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
+from jaxgrasp.robustness.tightening.objectives import LeastEffort
+from jaxgrasp.robustness.tightening.program import ScaledProgram
 
 
 def least_effort(
@@ -68,25 +71,22 @@ def least_effort(
         Zero for grasps without an answer.
     """
     pyramid_facets(cone_edges)
-    return over_grasps(
-        _LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"),
-        contacts,
-        disturbances,
-        required_wrench=required_wrench,
-        compliance=compliance,
-        cone_margin=cone_margin,
-        effort_weights=effort_weights,
-        margin=margin,
-        smoothing=smoothing,
-        actuation=actuation,
-    )[0]
+    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin, actuation)
+    options = Options(
+        margin=as_float("margin", margin, ()),
+        smoothing=optional_float("smoothing", smoothing),
+        effort_weights=optional_float("effort_weights", effort_weights),
+    )
+    return over_grasps(_LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)[0]
 
 
 class _LeastEffort(Tightening):
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
-        first, record, _ = solve_margin(replace(grasps, smoothing=None), program)
+    objective = LeastEffort()
+
+    def _solve(self, grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Evidence | None]:
+        first, record, _ = solve_margin(replace(grasps, options=replace(grasps.options, smoothing=None)), program)
         return solve_effort(grasps, program, first, record), self._evidence(grasps, program, record)
 
     def tangents(self, along: Along, found: tuple) -> tuple:
         out = found[0]
-        return changed(found, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)
+        return change_of_results(found, self._central(along, self._point(out, jnp.isfinite(out.effort))), None)

@@ -1,7 +1,8 @@
-"""The common part of the batched programs (21) and (22): what they hand out, its audit and its derivatives."""
+"""The common part of the batched programs (21) and (22): their results, the audit of these and their derivatives."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,29 +14,34 @@ from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.decisions import evidence
-from jaxgrasp.robustness.tightening.derivatives import CentralPoint, Point
-from jaxgrasp.robustness.tightening.program import Program, prepared
+from jaxgrasp.robustness.tightening.derivatives import CentralPoint
+from jaxgrasp.robustness.tightening.objectives import Objective
+from jaxgrasp.robustness.tightening.points import Point
+from jaxgrasp.robustness.tightening.program import ScaledProgram, prepare
 from jaxgrasp.solvers.block.kkt import Record
 from jaxgrasp.solvers.status import Status
 
 
 @dataclass(frozen=True)
 class Tightening(OfPyramids, Audited, ABC):
-    """The common part of the kernels of (21) and (22), whose results are a solution and evidence for its audit."""
+    """The common part of (21) and (22) as batched functions; their results are a solution and evidence for an audit."""
 
+    objective: ClassVar[Objective]
+    """Which of the two programs this is."""
     smooth: bool
+    """Whether the central point is asked for in place of the optimum."""
     evident: bool = True
-    """Whether the kernel writes evidence; without an audit nobody reads it."""
+    """Whether evidence is part of the results; without an audit nobody reads it."""
 
     @property
     def stages(self) -> tuple:
         """Scale the grasps, then solve them."""
-        return (lambda grasps, _: prepared(grasps, self.cone_edges), lambda given: self._solve(*given))
+        return (lambda grasps, _: prepare(grasps, self.cone_edges), lambda scaled: self._solve(*scaled))
 
     @abstractmethod
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]: ...
+    def _solve(self, grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Evidence | None]: ...
 
-    def _evidence(self, grasps: Grasps, program: Program, record: Record) -> Evidence | None:
+    def _evidence(self, grasps: Grasps, program: ScaledProgram, record: Record) -> Evidence | None:
         return evidence(grasps, program, record) if self.evident else None
 
     def judge(self, arguments: Arguments, out: tuple[Solution, Evidence], anew: bool) -> Verdict:
@@ -58,12 +64,12 @@ class Tightening(OfPyramids, Audited, ABC):
 
     def _central(self, along: Along, point: Point) -> Point:
         """The derivative of everything at the central point, which is the point itself where smoothing is asked for."""
-        kernel = CentralPoint(self.cone_edges)
+        kernel = CentralPoint(self.cone_edges, self.objective)
         return kernel.tangents(along, point if self.smooth else along.value(kernel, point))
 
 
-def changed(found: tuple[Solution, Evidence | None], change: Point, upper_bound: jax.Array | None) -> tuple:
-    """A change of the results; None for what does not vary, or counts as if it did not."""
+def change_of_results(found: tuple[Solution, Evidence | None], change: Point, upper_bound: jax.Array | None) -> tuple:
+    """The change of the results; None for fields that do not vary, or count as if they did not."""
     varying = change._asdict() | {"upper_bound": upper_bound}
     still = jax.tree.map(lambda _: None, found[1])
     changes: dict[str, Tree] = {f.name: varying.get(f.name) for f in fields(Solution)}

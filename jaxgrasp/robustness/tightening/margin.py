@@ -14,11 +14,13 @@ from jaxgrasp.lanes.differentiable import Along
 from jaxgrasp.robustness.auditing.pyramids import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
+from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.robustness.tightening.decisions import at_centre, solve_margin
-from jaxgrasp.robustness.tightening.derivatives import envelope_adjoint
-from jaxgrasp.robustness.tightening.kernel import Tightening, changed
-from jaxgrasp.robustness.tightening.program import Program
+from jaxgrasp.robustness.tightening.derivatives import envelope_adjoint, is_compact, set_changes
+from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
+from jaxgrasp.robustness.tightening.objectives import LargestMargin
+from jaxgrasp.robustness.tightening.program import ScaledProgram
 from jaxgrasp.solvers.status import Status
 
 
@@ -80,26 +82,20 @@ def largest_disturbance(
         smoothing all are those of the answer. Exactly zero for grasps without a finite margin.
     """
     pyramid_facets(cone_edges)
-    return over_grasps(
-        _LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"),
-        contacts,
-        disturbances,
-        required_wrench=required_wrench,
-        compliance=compliance,
-        cone_margin=cone_margin,
-        smoothing=smoothing,
-        cutoff=cutoff,
-        actuation=actuation,
-    )[0]
+    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin, actuation)
+    options = Options(smoothing=optional_float("smoothing", smoothing), cutoff=optional_float("cutoff", cutoff))
+    return over_grasps(_LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)[0]
 
 
 class _LargestDisturbance(Tightening):
-    def _solve(self, grasps: Grasps, program: Program) -> tuple[Solution, Evidence | None]:
+    objective = LargestMargin()
+
+    def _solve(self, grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Evidence | None]:
         best, record, iterate = solve_margin(grasps, program)
         solution = best
-        if grasps.smoothing is not None:
+        if grasps.options.smoothing is not None:
             possible = ~(program.wrench_outside | program.disturbance_outside | program.undisturbed)
-            solution = at_centre(grasps, program, iterate, best, grasps.valid & possible)
+            solution = at_centre(self.objective, grasps, program, iterate, best, grasps.valid & possible)
         return solution, self._evidence(grasps, program, record)
 
     def tangents(self, along: Along, found: tuple) -> tuple:
@@ -107,6 +103,7 @@ class _LargestDisturbance(Tightening):
         point = self._point(out, jnp.isfinite(out.margin) & (out.status != Status.PRUNED))
         change = self._central(along, point)
         if not self.smooth:
-            adjoint = partial(envelope_adjoint, self.cone_edges)
-            change = change._replace(margin=along.adjoint(adjoint, point, (out.margin,))[0])
-        return changed(found, change, change.margin)
+            adjoint = partial(envelope_adjoint, self.cone_edges, set_changes(along))
+            compact = is_compact(along)
+            change = change._replace(margin=along.adjoint(adjoint, point, (out.margin,), compact)[0])
+        return change_of_results(found, change, change.margin)

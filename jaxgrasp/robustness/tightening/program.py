@@ -19,22 +19,20 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.contact.row_space import RANK_TOLERANCE, Basis, whitened
 from jaxgrasp.lanes.fence import fenced
-from jaxgrasp.robustness.actuators import EffortRows, effort_unit, joined_rows, packed, unpacked
+from jaxgrasp.robustness.actuators import ActuatorRows, actuator_unit, join_rows, pack, unpack
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.worst_case import reach_outside, worst_rows
-from jaxgrasp.solvers.block.effort import EffortProblem, least_curvature
+from jaxgrasp.robustness.worst_case import RowLosses, reach_outside, worst_rows
 from jaxgrasp.solvers.block.kkt import Blocks, Record, Rows, total
-from jaxgrasp.solvers.block.margin import MarginProblem
 from jaxgrasp.solvers.interior_point import Iterate
 
 # Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
 LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
 # The most that dropping rows may turn those that are kept: as much as rows of an answer may be missed by.
-_TURNED = 1e-7
+_MOST_TURNED = 1e-7
 
 
 class Equalities(NamedTuple):
-    """Rows of G f = b, and of J'f - B u = 0, for scaled unknowns: forces in units of `Program.mean`.
+    """Rows of G f = b, and of J'f - B u = 0, for scaled unknowns: forces in units of `ScaledProgram.mean`.
 
     columns: (eq, k, n, *lanes) a group.
     wrench: (eq, *lanes), the right-hand side.
@@ -51,7 +49,7 @@ class Equalities(NamedTuple):
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
-class Program:
+class ScaledProgram:
     """Scaled data of a batch of grasps; lanes trail."""
 
     cone_edges: int = field(metadata={"static": True})
@@ -74,8 +72,8 @@ class Program:
     """mu F, (n, *lanes), N."""
     normal: jax.Array
     """F, (n, *lanes), N."""
-    given: "Equalities"
-    """The equality rows as they came, before `columns` were made of them."""
+    original: Equalities
+    """The equality rows before `columns` were made of them."""
     basis: Basis
     """Row operations from the rows in newtons to the orthonormal ones, for forces in units of `mean`."""
     mean: jax.Array
@@ -95,15 +93,15 @@ class Program:
     slippery: jax.Array
     """bool (*lanes): a contact without friction has to bear tangential force, so the margin cannot be positive."""
 
-    efforts: EffortRows | None
-    """What the actuators add."""
+    actuators: ActuatorRows | None
+    """What the actuators add; None where there are none."""
     joint_sizes: jax.Array | None
-    """(n_v, *lanes), what the rows of J'f - B u were divided by."""
+    """(n_v, *lanes), what the rows of J'f - B u were divided by; None without actuators."""
 
     @property
     def groups(self) -> tuple[Blocks, ...]:
         """The contacts, and the actuators where there are any."""
-        return (self.blocks,) if self.efforts is None else (self.blocks, self.efforts.blocks)
+        return (self.blocks,) if self.actuators is None else (self.blocks, self.actuators.blocks)
 
     @property
     def blocks(self) -> Blocks:
@@ -125,25 +123,25 @@ class Program:
         return 1 + 1 / math.cos(math.pi / self.cone_edges)
 
     def forces(self, x: jax.Array) -> jax.Array:
-        """Contact forces (n, 3, *lanes), N, from scaled ones (3, n, *lanes)."""
+        """Turn scaled forces (3, n, *lanes) into contact forces (n, 3, *lanes), N."""
         return jnp.stack([x[0] * self.tangential, x[1] * self.tangential, x[2] * self.normal], 1)
 
     def row_units(self) -> jax.Array:
-        """What one unit of every scaled row is in newtons, (n_e + 1, n, *lanes)."""
+        """The unit of every scaled row, (n_e + 1, n, *lanes), N."""
         edges = jnp.broadcast_to(self.tangential, (self.cone_edges, *self.tangential.shape))
         return jnp.concatenate([edges, self.normal[None]])
 
     def wrench_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
-        """Multipliers of G f = b (6, *lanes) from those of the orthonormal rows, per unit of the scaled objective."""
+        """Turn multipliers of the orthonormal rows into those of G f = b, (6, *lanes), for the scaled objective."""
         return self.row_multipliers(y)[:6] / self.mean * units
 
     def joint_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
-        """The same of J'f - B u = 0, (n_v, *lanes), where there are actuators."""
+        """Turn multipliers of the orthonormal rows into those of J'f - B u = 0, (n_v, *lanes); with actuators alone."""
         assert self.joint_sizes is not None
         return self.row_multipliers(y)[6:] / self.mean / self.joint_sizes * units[5]
 
     def row_multipliers(self, y: jax.Array) -> jax.Array:
-        """T'y, (eq, *lanes): multipliers of the rows as they came from those of the orthonormal ones."""
+        """T'y, (eq, *lanes): the multipliers of the original rows that belong to those of the orthonormal ones."""
         kept = self.basis.kept * y
         return fold(jnp.add, [row * k for row, k in zip(self.basis.operations, kept, strict=True)])
 
@@ -153,106 +151,172 @@ class Program:
         return fold(jnp.add, [self.basis.operations[:, c] * y[c] for c in range(6)]) * self.basis.kept
 
 
-def scaled_program(grasps: Grasps, cone_edges: int) -> Program:
+def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
     """Scale the programs of a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
-    cone, bound, effort, basis = worst_rows(grasps, cone_edges)
+    losses = worst_rows(grasps, cone_edges)
+
+    # Inequality rows: forces in units of the most that a contact exerts, actuator efforts in units of their limits.
     tangential = jnp.maximum(grasps.friction, LEAST_FRICTION[dtype.name]) * grasps.max_force
     normal = grasps.max_force
+    unit = None if grasps.actuated is None else actuator_unit(grasps.actuated)
+    rows = _scale_rows(grasps, losses, tangential, unit)
+
+    # Equality rows: in newtons over the mean largest force, then orthonormal. No derivative depends on the mean.
+    mean = fold(jnp.add, normal * present) / jnp.maximum(fold(jnp.add, present), 1)
+    mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
+    scales = jnp.stack([tangential, tangential, normal]) / mean
+    equalities = _scale_equalities(grasps, scales, grasps.wrench / mean, None if unit is None else unit / mean)
+    wrench = equalities.original.wrench
+    actuators = None
+    if grasps.actuated is not None and unit is not None and equalities.actuators is not None:
+        limits = jnp.stack([grasps.actuated.upper, -grasps.actuated.lower]) / unit
+        assert rows.actuator_sigma is not None
+        actuators = ActuatorRows(equalities.actuators, rows.actuator_sigma, limits, unit)
+    coordinates, kept = equalities.basis.coordinates(wrench), equalities.basis.kept
+
+    # What lies outside the range of G: more of it than rounding leaves.
+    largest = fold(jnp.maximum, jnp.abs(wrench))
+    tolerance = 10 * RANK_TOLERANCE[dtype.name]
+    wrench_outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > tolerance * largest
+    reach = reach_outside(grasps, losses.basis)
+    return ScaledProgram(
+        cone_edges=cone_edges,
+        columns=equalities.forces,
+        sigma=rows.sigma,
+        h=rows.h,
+        present=present,
+        rhs=coordinates * kept,
+        dropped=1 - kept,
+        scale=rows.scale,
+        tangential=tangential,
+        normal=normal,
+        original=equalities.original,
+        basis=equalities.basis,
+        mean=mean,
+        rank=fold(jnp.add, losses.basis.kept[:6]).astype(jnp.int32),
+        least_ratio=fold(jnp.minimum, jnp.where(losses.basis.kept > 0, losses.basis.ratios, 1)[:6]),
+        doubtful=_doubtful(grasps, losses.basis, reach, tolerance),
+        undisturbed=rows.undisturbed,
+        disturbance_outside=reach > tolerance,
+        wrench_outside=wrench_outside,
+        slippery=((grasps.friction <= 0) & (fold(jnp.maximum, losses.cone) > 0)).any(0),
+        actuators=actuators,
+        joint_sizes=equalities.joint_sizes,
+    )
+
+
+class _ScaledRows(NamedTuple):
+    """The scaled inequality rows A x + sigma lambda <= h.
+
+    sigma, h: (n_e + 1, n, *lanes), of the contacts.
+    actuator_sigma: (2, n_u, *lanes), of the actuators; None without any.
+    scale: (*lanes), Lambda.
+    undisturbed: bool (*lanes), sigma = 0.
+    """
+
+    sigma: jax.Array
+    h: jax.Array
+    actuator_sigma: jax.Array | None
+    scale: jax.Array
+    undisturbed: jax.Array
+
+
+def _scale_rows(grasps: Grasps, losses: RowLosses, tangential: jax.Array, unit: jax.Array | None) -> _ScaledRows:
+    """Divide every row by the force that it bounds, and sigma by its largest entry."""
+    present = grasps.present
 
     @fenced
     def scale_rows(
         cone: jax.Array,
         bound: jax.Array,
-        effort: jax.Array | None,
+        actuators: jax.Array | None,
         tangential: jax.Array,
         normal: jax.Array,
         reserve: jax.Array,
     ) -> tuple:
         sigmas = [jnp.concatenate([cone / tangential, (bound / normal)[None]])]
-        if effort is not None:
-            sigmas.append(effort)
+        if actuators is not None:
+            sigmas.append(actuators)
         largest = fold(jnp.maximum, [fold(jnp.maximum, fold(jnp.maximum, sigma)) for sigma in sigmas])
         undisturbed = largest == 0
-        # A choice of units, like the mean below: no derivative depends on it.
+        # A choice of units: no derivative depends on it.
         scale = lax.stop_gradient(1 / jnp.where(undisturbed, 1, largest))
         ones = [present, 1]
         sigmas = [jnp.where(undisturbed, one, sigma * scale) for one, sigma in zip(ones, sigmas, strict=False)]
         # What is left of a zero after rounding is a zero.
-        sigmas = [jnp.where(sigma > 8 * jnp.finfo(dtype).eps, sigma, 0) for sigma in sigmas]
+        sigmas = [jnp.where(sigma > 8 * jnp.finfo(present.dtype).eps, sigma, 0) for sigma in sigmas]
         lost = jnp.where(present > 0, -reserve / tangential, 1)
         h = jnp.concatenate([jnp.broadcast_to(lost, cone.shape), jnp.ones_like(bound)[None]])
         return sigmas, h, scale, undisturbed
 
-    unit = None if grasps.actuated is None else effort_unit(grasps.actuated)
-    effort = None if effort is None or unit is None else effort / unit
-    sigmas, h, scale, undisturbed = scale_rows(cone, bound, effort, tangential, normal, grasps.reserve)
-    mean = fold(jnp.add, normal * present) / jnp.maximum(fold(jnp.add, present), 1)
-    mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
-    scales = jnp.stack([tangential, tangential, normal]) / mean
-    wrench = grasps.wrench / mean
-    if grasps.actuated is None or unit is None:
-        given = (grasps.columns * scales,)
-        rows = whitened(given[0])
-        columns, efforts, sizes = rows.rows, None, None
-    else:
-        joined = joined_rows(grasps.actuated, grasps.columns * scales, scales, unit / mean)
-        rows, sizes, given = whitened(packed(joined)), joined.sizes, (joined.forces, joined.efforts)
-        columns, effort_columns = unpacked(rows.rows, present.shape[0], unit.shape[0])
-        limits = jnp.stack([grasps.actuated.upper, -grasps.actuated.lower]) / unit
-        efforts = EffortRows(effort_columns, sigmas[1], limits, unit)
-        wrench = jnp.concatenate([wrench, jnp.zeros_like(sizes)])
-    coordinates, kept = rows.coordinates(wrench), rows.kept
-    largest = fold(jnp.maximum, jnp.abs(wrench))
-    tolerance = 10 * RANK_TOLERANCE[dtype.name]
-    outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > tolerance * largest
-    reach = reach_outside(grasps, basis)
-    return Program(
-        cone_edges=cone_edges,
-        columns=columns,
-        sigma=sigmas[0],
-        h=h,
-        present=present,
-        rhs=coordinates * kept,
-        dropped=1 - kept,
-        scale=scale,
-        tangential=tangential,
-        normal=normal,
-        given=Equalities(given, wrench),
-        basis=rows,
-        mean=mean,
-        rank=fold(jnp.add, basis.kept[:6]).astype(jnp.int32),
-        least_ratio=fold(jnp.minimum, jnp.where(basis.kept > 0, basis.ratios, 1)[:6]),
-        doubtful=_doubtful(grasps, basis, reach, tolerance),
-        undisturbed=undisturbed,
-        disturbance_outside=reach > tolerance,
-        wrench_outside=outside,
-        slippery=((grasps.friction <= 0) & (fold(jnp.maximum, cone) > 0)).any(0),
-        efforts=efforts,
-        joint_sizes=sizes,
+    actuators = None if losses.actuators is None or unit is None else losses.actuators / unit
+    sigmas, h, scale, undisturbed = scale_rows(
+        losses.cone, losses.bound, actuators, tangential, grasps.max_force, grasps.reserve
     )
+    return _ScaledRows(sigmas[0], h, sigmas[1] if len(sigmas) > 1 else None, scale, undisturbed)
 
 
-def prepared(grasps: Grasps, cone_edges: int) -> tuple[Grasps, Program]:
-    """The programs, and what else of the grasps is needed to solve them: not the disturbance set."""
-    return replace(grasps, terms=(), extents=()), scaled_program(grasps, cone_edges)
+class _ScaledEqualities(NamedTuple):
+    """The orthonormal equality rows, and where they come from.
+
+    forces: (eq, 3, n, *lanes), columns of the contact forces.
+    actuators: (eq, 1, n_u, *lanes), columns of the actuator efforts; None without any.
+    joint_sizes: (n_v, *lanes), what the rows of J'f - B u were divided by; None without actuators.
+    basis: row operations from the original rows to the orthonormal ones.
+    original: the rows before.
+    """
+
+    forces: jax.Array
+    actuators: jax.Array | None
+    joint_sizes: jax.Array | None
+    basis: Basis
+    original: Equalities
+
+
+def _scale_equalities(
+    grasps: Grasps, scales: jax.Array, wrench: jax.Array, unit: jax.Array | None
+) -> _ScaledEqualities:
+    """Make the rows of G f = b, and of J'f - B u = 0, orthonormal.
+
+    Args:
+        grasps: the grasps.
+        scales: (3, n, *lanes), units of the forces over their mean.
+        wrench: (6, *lanes), b over the mean.
+        unit: (n_u, *lanes), units of the actuator efforts over the mean of forces; None without actuators.
+    """
+    if grasps.actuated is None or unit is None:
+        columns = (grasps.columns * scales,)
+        basis = whitened(columns[0])
+        return _ScaledEqualities(basis.rows, None, None, basis, Equalities(columns, wrench))
+    joined = join_rows(grasps.actuated, grasps.columns * scales, scales, unit)
+    basis = whitened(pack(joined))
+    forces, actuators = unpack(basis.rows, grasps.present.shape[0], unit.shape[0])
+    wrench = jnp.concatenate([wrench, jnp.zeros_like(joined.sizes)])
+    original = Equalities((joined.forces, joined.actuators), wrench)
+    return _ScaledEqualities(forces, actuators, joined.sizes, basis, original)
+
+
+def prepare(grasps: Grasps, cone_edges: int) -> tuple[Grasps, ScaledProgram]:
+    """Scale the programs; beside them, all of the grasps but the disturbance set is needed to solve them."""
+    return replace(grasps, terms=(), extents=()), scale_program(grasps, cone_edges)
 
 
 def actuated_values(
-    program: Program, x: Rows, multipliers: Record | Iterate, units: jax.Array, unit: jax.Array
+    program: ScaledProgram, x: Rows, multipliers: Record | Iterate, units: jax.Array, unit: jax.Array
 ) -> dict[str, jax.Array]:
-    """The part of a solution that comes with actuators: efforts, and multipliers for an objective in `unit`."""
-    if program.efforts is None:
+    """The fields of a solution that come with actuators, multipliers for an objective in `unit`; empty without any."""
+    if program.actuators is None:
         return {}
     return {
-        "actuator_efforts": x[1][0] * program.efforts.unit,
-        "actuator_multipliers": jnp.moveaxis(multipliers.z[1] / program.efforts.unit, 0, 1) * unit,
+        "actuator_efforts": x[1][0] * program.actuators.unit,
+        "actuator_multipliers": jnp.moveaxis(multipliers.z[1] / program.actuators.unit, 0, 1) * unit,
         "joint_multipliers": program.joint_multipliers(multipliers.y, units) * unit,
     }
 
 
 def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) -> jax.Array:
-    """Where the rank cannot be told, or what is in the range, or rounding makes much of a short row.
+    """Find where rounding leaves the rank of G, its range or its short rows in doubt, (*lanes).
 
     Dropping a row turns those that are kept by its length over that of the shortest one. Rows are taken in their order:
     beside a short one, what is left of a row that depends on it is rounding, eps over the short one's length. So in
@@ -272,65 +336,8 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
         most = fold(jnp.maximum, jnp.where(kept, 0, ratios)[:6])
         rounding = 16 * jnp.finfo(ratios.dtype).eps
         dependent = (most * least <= rounding) & (least > 1e-8)
-        return (least * second <= rounding) | (most > _TURNED * least) & ~dependent
+        return (least * second <= rounding) | (most > _MOST_TURNED * least) & ~dependent
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
     doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
     doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)
     return doubtful if len(ratios) == 6 else doubtful | ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)
-
-
-_REFINEMENTS = {"float64": 0, "float32": 1}
-
-
-def margin_problem(program: Program, cutoff: jax.Array | None = None) -> MarginProblem:
-    """(21); a margin below the cutoff, in units of the disturbances, is of no interest."""
-    refinements = _REFINEMENTS[program.rhs.dtype.name]
-    cutoff = None if cutoff is None else cutoff / program.scale
-    return MarginProblem(program.groups, program.rhs, program.dropped, program.radius, refinements, cutoff)
-
-
-class Effort(NamedTuple):
-    """(22): the problem (without a guess), the scaled margin that is asked for, and sqrt of the unit of effort."""
-
-    problem: EffortProblem
-    wanted: jax.Array
-    unit: jax.Array
-
-
-def effort_problem(grasps: Grasps, program: Program, guess: Rows = ()) -> Effort:
-    """(22)."""
-    blocks, *others = program.groups
-    dtype = program.rhs.dtype
-    wanted = jnp.where(program.disturbance_outside | program.slippery, 0, grasps.asked / program.scale)
-    eye = jnp.eye(3, dtype=dtype)[..., None, None]
-    # H = D Q_0 D = root' root with Q_0 = M^-T M^-1 for the inverse root M.
-    root = eye if grasps.weight_roots is None else grasps.weight_roots
-    root = root * jnp.stack([program.tangential, program.tangential, program.normal]) * blocks.present
-    largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
-    largest = jnp.where(largest > 0, largest, 1)
-
-    def held(group: Blocks, root: jax.Array) -> Blocks:
-        return group._replace(h=group.h - jnp.where(program.undisturbed, 0, group.sigma) * wanted, hessian_root=root)
-
-    # The actuators' efforts cost nothing.
-    groups = (held(blocks, root / largest), *[held(g, jnp.zeros_like(g.present)[None, None]) for g in others])
-    problem = EffortProblem(
-        groups,
-        program.rhs,
-        program.dropped,
-        program.radius,
-        _REFINEMENTS[dtype.name],
-        guess,
-        tuple(least_curvature(g.root) for g in groups),
-    )
-    return Effort(problem, wanted, largest)
-
-
-def weighed(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """Q_0 f of forces (n, 3, *lanes); weights None for Q_0 = I."""
-    return forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
-
-
-def effort_of(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
-    return 0.5 * fold(jnp.add, fold(jnp.add, forces * weighed(forces, weights)))
