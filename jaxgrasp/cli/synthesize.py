@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.problems import CommandError, check_options, check_output, write_files
+from jaxgrasp.cli.problems import CommandError, check_options, check_output, conclude, write_files
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
-from jaxgrasp.cli.streams import one_line, printing
+from jaxgrasp.cli.streams import printing
 from jaxgrasp.cli.synthesize_hand import SceneSynthesis
 from jaxgrasp.storage import atomic_write, printable
 
@@ -88,10 +88,11 @@ class Synthesize(Reading):
         """Synthesises, writes and prints.
 
         Returns:
-            The exit code: 0, or 2 where a file could not be written in the end.
+            The exit code: 0.
 
         Raises:
-            CommandError: The options or the files cannot be used.
+            CommandError: The options or the files cannot be used, a file could not be written in the end, or Ctrl-C has
+                ended the work early.
         """
         self._check()
         configure_jax()
@@ -109,13 +110,12 @@ class Synthesize(Reading):
         found = self._synthesize(shape, centre, disturbances)
         from jaxgrasp.cli.report import print_synthesis
 
-        written, failed = self._write(found, shape, name, unit)
+        written, unwritten = self._write(found, shape, name, unit)
         zeros = self._why_zero(found, disturbances)
-        if found.interrupted:
-            one_line(f"{signals.word()}: grasps are those of fewer steps")
         with printing():
             print_synthesis(found, name, note, unit, zeros, written)
-        return 130 if found.interrupted else 2 if failed else 0
+        conclude(f"{signals.word()}: grasps are those of fewer steps" if found.interrupted else "", unwritten)
+        return 0
 
     def _check(self) -> None:
         span = math.inf if self.span is None else self.span
@@ -213,7 +213,7 @@ class Synthesize(Reading):
             cone_edges=self.cone_edges,
         )
 
-    def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], bool]:
+    def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], list[str]]:
         import jax
         import numpy as np
 
