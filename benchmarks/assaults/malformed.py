@@ -64,7 +64,8 @@ def _leave_out_computation() -> None:
 
     jaxgrasp.ranking.rank = unsolved
     jaxgrasp.geometry.sample_surface = accept
-    jaxgrasp.cli.scene.Scene.candidates = accept
+    # The first that a command does with a model that was read.
+    jaxgrasp.cli.scene.Scene._sampled = accept
 
 
 def _wrongly_accepted(case: Case) -> str:

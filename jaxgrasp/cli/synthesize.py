@@ -169,7 +169,10 @@ class Synthesize(Reading):
         import jax
 
         mesh = geometry.Mesh.from_file(path, self.scale)
-        grid = mesh.to_grid()
+        try:
+            grid = mesh.to_grid()
+        except geometry.MeshError as error:
+            raise geometry.MeshError(f"{path}: {error}") from None
         points = np.asarray(geometry.sample_surface(grid, jax.random.key(self.seed), 4096))
         off = mesh.deviation(points) * 1e3
         note = (
