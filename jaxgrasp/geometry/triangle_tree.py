@@ -20,7 +20,7 @@ ROUNDING = np.float32(1e-6)
 # Radii of a part between it and a block to which it is a dipole: the sum is then off by about 1e-3.
 _FAR = 2.0
 # Pairs of a block and a part at a time, about a hundred bytes each.
-_PAIRS = 1 << 17
+_PAIRS = 1 << 18
 
 
 class Pairs(NamedTuple):

@@ -13,7 +13,7 @@ from jaxgrasp.geometry.triangle_tree import BLOCK, ROUNDING, Blocks, Pairs, Tria
 from jaxgrasp.storage import allowance
 
 # Pairs of a leaf and a block at a time: calls cost little then, and one program serves all meshes.
-_CHUNK = 8192
+_CHUNK, _FEW = 8192, 512
 # arctan(r) / r for 0 <= r <= 1 as a polynomial in r^2, highest power first: interpolated at Chebyshev's points.
 _ARCTAN = (
     0.0027662835,
@@ -89,13 +89,14 @@ def _spent(before: int, more: int) -> int:
 
 def _in_chunks(function: Callable[..., Array], parts: np.ndarray, points: np.ndarray, pairs: Pairs) -> np.ndarray:
     """A function of parts and of blocks of points for all pairs of them, (pairs, ...)."""
-    found = []
+    found, begin = [], 0
     # At least one chunk tells the shape.
-    for begin in range(0, max(1, len(pairs.blocks)), _CHUNK):
-        own, places = (x[begin : begin + _CHUNK] for x in pairs)
-        missing = _CHUNK - len(own)
+    while begin < max(1, len(pairs.blocks)):
+        size = _CHUNK if len(pairs.blocks) - begin > _CHUNK // 4 else _FEW
+        own, places = (x[begin : begin + size] for x in pairs)
+        missing, begin = size - len(own), begin + size
         own, places = np.pad(own, (0, missing)), np.pad(places, (0, missing))
-        found.append(np.asarray(function(parts[places], points[own]))[: _CHUNK - missing])
+        found.append(np.asarray(function(parts[places], points[own]))[: size - missing])
     return np.concatenate(found)
 
 
