@@ -1,7 +1,8 @@
-"""Starting `jaxgrasp` as its users do, in a folder with candidates and nothing else."""
+"""Starting `jaxgrasp` as its users do, in a folder with candidates, grasps of a hand, and nothing else."""
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,10 @@ import numpy as np
 
 # As the script that pip installs does.
 PROGRAM = [sys.executable, "-c", "import sys\nfrom jaxgrasp.cli import program\nsys.exit(program())"]
-GRASPS = "grasps.npz"
+GRASPS, OF_HAND = "grasps.npz", "hands.npz"
+# Of the four fingers around a ball of 5 cm.
+_BENT, _SQUEEZED, _BALL = (0.0, -0.165, 1.124), (0.0, 0.1, 0.1), (0.0, 0.0, 0.085)
+ON_HAND = ["--hand", "four_fingers", "--object", "sphere", "--grasps", OF_HAND]
 
 
 def write_grasps(folder: Path, count: int, **columns: Any) -> None:
@@ -28,15 +32,32 @@ def write_grasps(folder: Path, count: int, **columns: Any) -> None:
     )
 
 
+def write_hand_grasps(folder: Path, count: int) -> None:
+    """Writes grasps that squeeze a ball, each one a little differently."""
+    joints = np.tile(_BENT, 4) + np.random.default_rng(0).normal(scale=0.003, size=(count, 12))
+    base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (count, 1))
+    np.savez(
+        folder / OF_HAND,
+        grasp_qpos=np.concatenate([base, joints], -1),
+        squeeze_qpos=np.concatenate([base, joints + np.tile(_SQUEEZED, 4)], -1),
+        obj_pose=np.tile([*_BALL, 1.0, 0, 0, 0], (count, 1)),
+        obj_scale=np.full(count, 0.05),
+        object_name=np.full(count, "ball"),
+    )
+
+
 def made(folder: Path) -> list[Path]:
-    """What commands have written."""
-    return [path for path in folder.iterdir() if path.name != GRASPS]
+    """What commands have written, folders and files in them."""
+    return [path for path in folder.rglob("*") if path.name not in (GRASPS, OF_HAND)]
 
 
 def empty(folder: Path) -> None:
     """Removes what commands have written."""
-    for path in made(folder):
-        path.unlink()
+    for path in folder.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name not in (GRASPS, OF_HAND):
+            path.unlink()
 
 
 def unsolved(candidates: Any, *_: Any, progress: Callable[[int], None] = lambda _: None, **__: Any) -> Any:

@@ -21,13 +21,16 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.assaults.commands import GRASPS, PROGRAM, empty, write_grasps
+from benchmarks.assaults.commands import GRASPS, OF_HAND, ON_HAND, PROGRAM, empty, write_grasps, write_hand_grasps
 
 COMMANDS = {
     "rank": ["rank", "grasps.npz"],
     "rank --scene": ["rank", "--scene", "four_fingers", "--samples", "50", "--picture", "None", "--figure", "None"],
     "synthesize": ["synthesize", "--starts", "16", "--steps", "10", "--figure", "None"],
     "compare": ["compare", "grasps.npz", "--metric", "margin,min_weight"],
+    "squeeze": ["squeeze", *ON_HAND],
+    "evaluate": ["evaluate", *ON_HAND, "--figure", "None"],
+    "convert": ["convert", "hands.npz", "--to", "dexgraspbench", "--output", "converted"],
     "--help": ["--help"],
 }
 
@@ -111,7 +114,9 @@ def main() -> None:
         home.mkdir()
         home.chmod(0o777)
         write_grasps(home, 50, object_name=np.full(50, "größe 猫 $x_\\{"))
-        (home / GRASPS).chmod(0o644)
+        write_hand_grasps(home, 4)
+        for name in (GRASPS, OF_HAND):
+            (home / name).chmod(0o644)
         for given in environments(root):
             if (output.only or "") not in given.name:
                 continue

@@ -20,8 +20,8 @@ import platform
 import subprocess
 import sys
 import tempfile
-import time
-import traceback
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from benchmarks.assaults.grasp_cases import quietly
 from benchmarks.assaults.grasp_samples import HAND, JOINTS
 from benchmarks.assaults.hostile_pickles import CANARY
 from benchmarks.assaults.inputs import Case
-from benchmarks.assaults.malformed import Outcome, table, wait
+from benchmarks.assaults.outcomes import Outcome, commanded, forked, table
 
 OUT = "out.npz"
 
@@ -50,49 +50,14 @@ def arguments(paths: list[Path]) -> list[str]:
     ]
 
 
-def forked(case: Case, home: Path) -> Outcome:
-    """Runs one in a child of this process."""
-    begun = time.perf_counter()
-    child = os.fork()
-    if child == 0:
-        code = 70
-        try:
-            os.chdir(home)
-            for number, name in ((1, "out"), (2, "err")):
-                os.dup2(os.open(home / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
-            sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
-            from jaxgrasp.cli import main
-
-            code = main(arguments([case.path]))
-        except SystemExit as leaving:
-            code = leaving.code if isinstance(leaving.code, int) else 70
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stderr.flush()
-            os._exit(code)
-    return _outcome(case, home, child, begun)
-
-
-def commanded(case: Case, home: Path) -> Outcome:
-    """Runs one as a command, whose time and memory include the start of Python."""
-    begun = time.perf_counter()
-    command = [sys.executable, "-m", "jaxgrasp.cli", *arguments([case.path])]
-    with open(home / "err", "w") as errors:
-        process = subprocess.Popen(command, cwd=home, stdout=subprocess.DEVNULL, stderr=errors)
-        found = _outcome(case, home, process.pid, begun)
-        process.returncode = found.code
-    return found
-
-
-def _outcome(case: Case, home: Path, child: int, begun: float) -> Outcome:
-    code, usage = wait(child, begun)
-    errors = (home / "err").read_text("utf-8", "replace")
-    wrong = "a canary" if (home / CANARY).exists() else "accepted" if code == 0 or (home / OUT).exists() else ""
+def tried_with(run: Callable[[Case, list[str], Path], Outcome], case: Case, home: Path) -> Outcome:
+    """Runs one, and looks for what it must not have left."""
+    found = run(case, arguments([case.path]), home)
+    accepted = found.code == 0 or (home / OUT).exists()
+    wrong = "a canary" if (home / CANARY).exists() else "accepted" if accepted else ""
     for name in (CANARY, OUT):
-        with contextlib.suppress(FileNotFoundError):
-            (home / name).unlink()
-    return Outcome(case, code, errors, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, wrong)
+        (home / name).unlink(missing_ok=True)
+    return replace(found, accepted_wrongly=wrong)
 
 
 def together(tried: list[Case], home: Path) -> str:
@@ -139,7 +104,7 @@ def main() -> None:
         tried = [case for case in made if given.kind in (None, case.kind)]
         found = []
         for case in tried:
-            found.append(forked(case, home))
+            found.append(tried_with(forked, case, home))
             if given.verbose or found[-1].faults or found[-1].code == 0:
                 print(case.kind, repr(case.name), found[-1].code, f"{found[-1].seconds:.1f} s", end=" ")
                 print(f"{found[-1].mebibytes:.0f} MiB", found[-1].faults, found[-1].errors[-300:].strip(), flush=True)
@@ -147,7 +112,7 @@ def main() -> None:
         text += f", Python {platform.python_version()}, NumPy {np.__version__}, {os.cpu_count()} cores.\n\n"
         text += table(found, "In forked processes")
         if given.sample:
-            text += "\n" + table([commanded(case, home) for case in tried[:: given.sample]], "As commands")
+            text += "\n" + table([tried_with(commanded, case, home) for case in tried[:: given.sample]], "As commands")
         text += "\n" + together(tried, home)
     print(text)
     if given.output:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.assaults.arrays import archives, arrays
+from benchmarks.assaults.further import more_archives, more_arrays, more_models, more_obj, more_ply, more_stl
 from benchmarks.assaults.models import models
 from benchmarks.assaults.shapes import large_obj, large_ply, large_stl, obj, ply, stl
 
@@ -24,13 +25,14 @@ class Case:
 
 
 MAKERS = {
-    "npz": (archives,),
-    "npy": (arrays,),
-    "stl": (stl, large_stl),
-    "obj": (obj, large_obj),
-    "ply": (ply, large_ply),
-    "xml": (models,),
+    "npz": (archives, more_archives),
+    "npy": (arrays, more_arrays),
+    "stl": (stl, more_stl, large_stl),
+    "obj": (obj, more_obj, large_obj),
+    "ply": (ply, more_ply, large_ply),
+    "xml": (models, more_models),
 }
+LARGE = (large_stl, large_obj, large_ply)
 
 
 def cases(folder: Path, only: str | None = None, seed: int = 0, large: bool = False) -> list[Case]:
@@ -42,7 +44,7 @@ def cases(folder: Path, only: str | None = None, seed: int = 0, large: bool = Fa
         home = folder / kind
         home.mkdir(parents=True)
         names = os.fspath(home)
-        made = (make(random.Random(seed), home) for make in makes[: None if large else 1])
+        made = (make(random.Random(seed), home) for make in makes if large or make not in LARGE)
         for name, content in itertools.chain.from_iterable(made):
             path = Path(names, f"{len(found):04d}_{name}.{kind}")
             if isinstance(content, bytes):

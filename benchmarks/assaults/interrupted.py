@@ -20,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.assaults.commands import PROGRAM, empty, made, write_grasps
+from benchmarks.assaults.commands import ON_HAND, PROGRAM, empty, made, write_grasps, write_hand_grasps
 
 COMMANDS = {
     "rank": ["rank", "grasps.npz", "--figure", "ranking.png"],
@@ -29,6 +29,9 @@ COMMANDS = {
     "synthesize": ["synthesize", "--starts", "256"],
     "synthesize --scene": ["synthesize", "--scene", "four_fingers", "--starts", "16", "--picture", "None"],
     "compare": ["compare", "grasps.npz", "--friction", "0.6", "--max-force", "5"],
+    "squeeze": ["squeeze", *ON_HAND],
+    "evaluate": ["evaluate", *ON_HAND],
+    "convert": ["convert", "hands.npz", "--to", "dexgraspbench", "--output", "converted"],
 }
 
 
@@ -52,6 +55,12 @@ def signalled(arguments: list[str], number: int, moment: float, home: Path) -> t
 
 
 def whole(path: Path) -> bool:
+    if path.is_dir():
+        return any(path.iterdir())
+    if path.suffix == ".npy":
+        from jaxgrasp.files import read_grasps
+
+        return len(read_grasps(path)) == 1
     if path.suffix == ".npz":
         import numpy as np
 
@@ -128,6 +137,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
         write_grasps(home, 100_000)
+        write_hand_grasps(home, 2_000)
         say("| command | within, s | signals | before its first line | ended at once | work kept | otherwise |")
         say("|---|---:|---:|---:|---:|---:|---|")
         for name in given.command or COMMANDS:

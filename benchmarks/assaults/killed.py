@@ -19,7 +19,11 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from jaxgrasp.candidates import Candidates
+from jaxgrasp.evaluation import Evaluation, write_evaluation
+from jaxgrasp.files import GraspSet, read_grasps, write_grasps
+from jaxgrasp.files.grasp_set import HandPoses
 from jaxgrasp.ranking import Ranking, write_table
+from jaxgrasp.simulation import protocol_named
 from jaxgrasp.storage import atomic_write
 from jaxgrasp.viewer import figure_of_ranking, write_figure
 
@@ -56,12 +60,48 @@ def ranking(count: int, factor: float = 1.0) -> Ranking:
     )
 
 
-def margins_of(path: Path) -> np.ndarray:
+def grasp_set(count: int) -> GraspSet:
+    draw = np.random.default_rng(1)
+    standing = np.tile([0.0, 0, 0, 1, 0, 0, 0], (count, 1))
+    poses = HandPoses(base=standing, joints=draw.normal(size=(count, 20)))
+    return GraspSet(
+        stages={"grasp": poses, "squeeze": poses},
+        joint_names=tuple(f"joint{k}" for k in range(20)),
+        object_pose=standing,
+        object_scale=np.full(count, 0.1),
+        object_name=np.full(count, "thing"),
+        source=np.array([f"a.npz:{row}" for row in range(count)]),
+        columns={"margin": draw.random(count), "forces": draw.normal(size=(count, 5, 3))},
+    )
+
+
+def evaluation(grasps: GraspSet) -> Evaluation:
+    draw, count = np.random.default_rng(2), len(grasps)
+    numbers = ("delta_pos", "delta_angle", "penetration", "self_penetration", "contact_distance", "contact_consistency")
+    return Evaluation(
+        protocol=protocol_named("dexgraspbench-fc"),
+        grasps=grasps,
+        object=grasps.object_name,
+        outcome=np.full(count, "held"),
+        held=np.ones(count, bool),
+        contact_number=np.full(count, 4),
+        loads=np.ones((count, 6), int),
+        said=(),
+        interrupted=False,
+        **{name: draw.random(count) for name in numbers},
+    )
+
+
+def column(path: Path, name: str) -> np.ndarray:
     if path.suffix == ".npz":
         with np.load(path) as archive:
-            return archive["margin"]
+            return archive[name]
     read = pyarrow.parquet.read_table if path.suffix == ".parquet" else pyarrow.csv.read_csv
-    return read(path)["margin"].to_numpy()
+    return read(path)[name].to_numpy()
+
+
+def margins_of(path: Path) -> np.ndarray:
+    return column(path, "margin")
 
 
 def writers(rows: int) -> dict[str, tuple[str, Callable[[Path], None], Callable[[Path], bool]]]:
@@ -96,9 +136,36 @@ def writers(rows: int) -> dict[str, tuple[str, Callable[[Path], None], Callable[
     def write(path: Path) -> None:
         write_table(table, path)
 
+    grasps = grasp_set(rows // 50)
+    tried = evaluation(grasps)
+
+    def same_grasps(path: Path) -> bool:
+        return np.array_equal(read_grasps(path).stages["grasp"].joints, grasps.stages["grasp"].joints)
+
+    def trials(path: Path) -> None:
+        write_evaluation(tried, path)
+
+    def folder(path: Path) -> None:
+        write_grasps(grasps.take(np.arange(200)), path.parent, "dexgraspbench")
+
+    def same_rows(path: Path) -> bool:
+        """Each file there is that of its row."""
+        files = [file for file in path.parent.glob("*.npy") if file.read_bytes() != OLD]
+        joints = grasps.stages["grasp"].joints
+        return all(np.allclose(read_grasps(f).stages["grasp"].joints[0], joints[int(f.stem)]) for f in files)
+
     found = {f"table {ending}": (ending, write, same) for ending in (".parquet", ".csv", ".npz")}
     found["candidates .npz"] = (".npz", candidates, lambda path: np.array_equal(margins_of(path), table.margin))
     found["figure .png"] = (".png", picture, ends)
+    found["grasps .npz"] = (".npz", lambda path: write_grasps(grasps, path), same_grasps)
+    found["grasps .yaml"] = (".yaml", lambda path: write_grasps(grasps, path, "isaac_grasp"), same_grasps)
+    found["folder of 200 grasps"] = ("000.npy", folder, same_rows)
+    for ending in (".parquet", ".csv", ".npz"):
+        found[f"trials {ending}"] = (
+            ending,
+            trials,
+            lambda path: np.array_equal(column(path, "delta_pos"), tried.delta_pos),
+        )
     found["kernel on disk"] = ("", kernel, read_kernel)
     return found
 
@@ -119,7 +186,7 @@ def killed(name: str, rows: int, count: int, folder: Path, draw: random.Random) 
     # As deep as the folder of kernels, and trusted as it is.
     home = folder / name.replace(" ", "_") / "jaxgrasp" / "kernels"
     home.mkdir(mode=0o700, parents=True)
-    path = home / f"file{ending}"
+    path = home / (ending if ending[:1].isdigit() else f"file{ending}")
     begun = time.perf_counter()
     os.waitpid(forked(lambda: write(path)), 0)
     length = time.perf_counter() - begun
@@ -127,12 +194,14 @@ def killed(name: str, rows: int, count: int, folder: Path, draw: random.Random) 
     outcomes = {"old": 0, "new": 0, "broken": 0, "gone": 0}
     littered = 0
     for _ in range(count):
+        for made in home.glob("[!.]*"):
+            made.unlink()
         path.write_bytes(OLD)
         child = forked(lambda: write(path))
         time.sleep(draw.uniform(0.0, 1.1 * length))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        littered += len(list(home.iterdir())) > 1
+        littered += any(home.glob(".*"))
         if not path.exists():
             outcomes["gone"] += 1
         elif path.read_bytes() == OLD:
@@ -140,7 +209,7 @@ def killed(name: str, rows: int, count: int, folder: Path, draw: random.Random) 
         else:
             outcomes["new" if is_whole(path) else "broken"] += 1
     os.waitpid(forked(lambda: write(path)), 0)
-    left = len(list(home.iterdir())) - 1
+    left = len(list(home.glob(".*")))
     cells = [f"{length:.2f}", count, *outcomes.values(), littered, left]
     return f"| {name} | {' | '.join(map(str, cells))} |"
 

@@ -12,57 +12,23 @@ what takes three minutes on the clock is killed.
 from __future__ import annotations
 
 import argparse
-import collections
 import os
-import resource
-import signal
-import subprocess
 import sys
 import tempfile
-import time
-import traceback
 import warnings
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.assaults import outcomes
 from benchmarks.assaults.arrays import grasps
 from benchmarks.assaults.commands import unsolved
 from benchmarks.assaults.inputs import Case, cases
+from benchmarks.assaults.outcomes import Outcome, table
 
-SECONDS, MEBIBYTES, KILLED_AFTER = 10.0, 600.0, 180.0
 RANK = ["--output", "table.csv", "--figure", "None", "--top", "2"]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    case: Case
-    code: int
-    """Negative for a signal."""
-    errors: str
-    seconds: float
-    """Of the processor, its children included."""
-    mebibytes: float
-    accepted_wrongly: str
-
-    @property
-    def faults(self) -> list[str]:
-        found = []
-        if self.code == 2 and (self.errors.count("\n") != 1 or not self.errors.startswith("jaxgrasp: ")):
-            found.append("not one line")
-        if self.code == 0 and not all(line.startswith("jaxgrasp: warning: ") for line in self.errors.splitlines()):
-            found.append("said something")
-        if self.code not in (0, 2):
-            found.append(f"exit {self.code}")
-        if self.seconds > SECONDS:
-            found.append("slow")
-        if self.mebibytes > MEBIBYTES:
-            found.append("large")
-        if self.accepted_wrongly:
-            found.append(self.accepted_wrongly)
-        return found
 
 
 def arguments(case: Case, good: Path) -> list[str]:
@@ -77,55 +43,13 @@ def arguments(case: Case, good: Path) -> list[str]:
 
 
 def forked(case: Case, good: Path, home: Path) -> Outcome:
-    """Runs one in a child of this process."""
-    begun = time.perf_counter()
-    child = os.fork()
-    if child == 0:
-        code = 70
-        try:
-            os.chdir(home)
-            for number, name in ((1, "out"), (2, "err")):
-                os.dup2(os.open(home / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
-            sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
-            _leave_out_computation()
-            from jaxgrasp.cli import main
-
-            code = main(arguments(case, good))
-        except SystemExit as leaving:
-            code = leaving.code if isinstance(leaving.code, int) else 70
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stderr.flush()
-            os._exit(code)
-    code, usage = wait(child, begun)
-    errors = (home / "err").read_text("utf-8", "replace")
-    wrong = _wrongly_accepted(case) if code == 0 else ""
-    return Outcome(case, code, errors, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, wrong)
+    found = outcomes.forked(case, arguments(case, good), home, _leave_out_computation)
+    return replace(found, accepted_wrongly=_wrongly_accepted(case)) if found.code == 0 else found
 
 
 def commanded(case: Case, good: Path, home: Path) -> Outcome:
-    """Runs one as a command, whose time and memory include the start of Python and of JAX."""
-    begun = time.perf_counter()
-    command = [sys.executable, "-m", "jaxgrasp.cli", *arguments(case, good)]
-    if case.kind not in ("npz", "npy"):
-        command += ["--samples", "8"] if case.kind == "xml" else ["--starts", "8", "--steps", "10"]
-    with open(home / "err", "w") as errors:
-        process = subprocess.Popen(command, cwd=home, stdout=subprocess.DEVNULL, stderr=errors)
-        code, usage = wait(process.pid, begun)
-        process.returncode = code
-    text = (home / "err").read_text("utf-8", "replace")
-    return Outcome(case, code, text, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, "")
-
-
-def wait(child: int, begun: float) -> tuple[int, resource.struct_rusage]:
-    while True:
-        found, status, usage = os.wait4(child, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status), usage
-        if time.perf_counter() - begun > KILLED_AFTER:
-            os.kill(child, signal.SIGKILL)
-        time.sleep(0.005)
+    few = {"npz": [], "npy": [], "xml": ["--samples", "8"]}.get(case.kind, ["--starts", "8", "--steps", "10"])
+    return outcomes.commanded(case, [*arguments(case, good), *few], home)
 
 
 def _leave_out_computation() -> None:
@@ -140,7 +64,8 @@ def _leave_out_computation() -> None:
 
     jaxgrasp.ranking.rank = unsolved
     jaxgrasp.geometry.sample_surface = accept
-    jaxgrasp.cli.scene.Scene.candidates = accept
+    # The first that a command does with a model that was read.
+    jaxgrasp.cli.scene.Scene._sampled = accept
 
 
 def _wrongly_accepted(case: Case) -> str:
@@ -163,26 +88,6 @@ def _wrongly_accepted(case: Case) -> str:
     except Exception as error:
         return f"accepted what NumPy refuses ({type(error).__name__})"
     return ""
-
-
-def table(found: list[Outcome], title: str) -> str:
-    lines = [
-        f"## {title}",
-        "",
-        "| kind | tried | refused, one line | accepted | otherwise | slowest, s | largest, MiB |",
-    ]
-    lines.append("|---|---:|---:|---:|---:|---:|---:|")
-    kinds = collections.defaultdict(list)
-    for outcome in found:
-        kinds[outcome.case.kind].append(outcome)
-    for kind, rows in [*kinds.items(), ("all", found)]:
-        refused = sum(row.code == 2 and not row.faults for row in rows)
-        accepted = sum(row.code == 0 and not row.faults for row in rows)
-        slowest, largest = max(row.seconds for row in rows), max(row.mebibytes for row in rows)
-        cells = [len(rows), refused, accepted, len(rows) - refused - accepted, f"{slowest:.1f}", f"{largest:.0f}"]
-        lines.append(f"| {kind} | {' | '.join(map(str, cells))} |")
-    lines += [""] + [f"- {r.case.kind} {r.case.name[:60]!r}: {', '.join(r.faults)}" for r in found if r.faults]
-    return "\n".join(lines) + "\n"
 
 
 def main() -> None:

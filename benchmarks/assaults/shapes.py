@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import struct
@@ -140,6 +141,28 @@ def large_stl(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
     yield "too_many", bytes(80) + struct.pack("<I", 1_070_000) + bytes(53_500_000)
 
 
+def lines_of(corners: np.ndarray) -> str:
+    return "".join(f"f {i} {j} {k}\n" for i, j, k in corners.tolist())
+
+
+def lines_of_points(points: np.ndarray) -> str:
+    return "".join(f"v {x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in points.tolist())
+
+
+def fine_ball(count: int) -> bytes:
+    """A ball of 2 count (count - 1) triangles, none of them like another."""
+    rows, columns = np.mgrid[0 : count + 1, 0:count]
+    down, around = np.pi * rows / count, 2 * np.pi * columns / count
+    radius = 0.05 + 0.005 * np.sin(7 * down) * np.cos(5 * around)
+    flat = np.sin(down)
+    points = radius[..., None] * np.stack([flat * np.cos(around), flat * np.sin(around), np.cos(down)], -1)
+    rows, columns = np.mgrid[0:count, 0:count]
+    here, right = 1 + rows * count + columns, 1 + rows * count + (columns + 1) % count
+    lower, upper = np.stack([here, here + count, right + count], -1), np.stack([here, right + count, right], -1)
+    corners = np.concatenate([lower[:-1].reshape(-1, 3), upper[1:].reshape(-1, 3)])
+    return (lines_of_points(points.reshape(-1, 3)) + lines_of(corners)).encode()
+
+
 def large_obj(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
     points = "".join(f"v {x} {y} {z}\n" for x, y, z in TETRAHEDRON)
     faces = "".join("f " + " ".join(str(i + 1) for i in f) + "\n" for f in FACES)
@@ -149,6 +172,10 @@ def large_obj(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
         "triangles": "f 1/1/1 2/2/2 3/3/3\n", "quads": "f 1 2 3 4\n", "backwards": "f -1 -2 -3\n", "empty": "\n",
     }.items():  # fmt: skip
         yield f"many_{label}", (points + line * (12_000_000 // len(line)) + faces).encode()
+    yield "even", fine_ball(540)
+    many = np.random.default_rng(0).normal(scale=0.05, size=(185, 3))
+    corners = np.array(list(itertools.combinations(range(1, 186), 3)))[:1_000_000]
+    yield "all_different", (lines_of_points(many) + lines_of(corners)).encode()
     yield "very_long_line", b"v " + b"1 " * 9_000_000 + b"\n" + good
     yield "many_corners", (points + "f " + "1 2 3 " * 1_000_000 + "\n").encode()
     yield "uneven", (points + "".join(f"f {'1 2 3 ' * (n % 100 + 1)}\n" for n in range(20_000))).encode()

@@ -10,12 +10,12 @@ if TYPE_CHECKING:
 
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.errors import CommandError
-from jaxgrasp.cli.streams import one_line
-from jaxgrasp.storage import check_writable, reason_of
+from jaxgrasp.cli.streams import notice, one_line
+from jaxgrasp.storage import check_writable, made_folder, reason_of
 
 
 class Skipped:
-    """Files that were passed over, each with a line on standard error."""
+    """Files that were passed over, as the caller wished: each has a line on standard error at once."""
 
     def __init__(self) -> None:
         """Starts with none."""
@@ -69,8 +69,24 @@ def check_output(path: Path, option: str, endings: Sequence[str], inputs: Sequen
         raise CommandError(f"{option} {path}: cannot be written ({reason_of(error)})") from error
 
 
+def check_output_folder(folder: Path) -> None:
+    """Finds out whether files can be written into a folder, and leaves everything as it was: also that it is not there.
+
+    Args:
+        folder: That of `--output`.
+
+    Raises:
+        CommandError: They cannot.
+    """
+    try:
+        with made_folder(folder):
+            check_writable(folder / "0")
+    except (OSError, ValueError) as error:
+        raise CommandError(f"--output {folder}: cannot be written ({reason_of(error)})") from error
+
+
 def warn_of_conventions(candidates: "Candidates") -> None:
-    """Tells on standard error, in one line, of units and directions of contacts that can hardly be meant.
+    """Notes, in one line, units and directions of contacts that can hardly be meant.
 
     Args:
         candidates: Grasps by their contacts.
@@ -79,22 +95,23 @@ def warn_of_conventions(candidates: "Candidates") -> None:
 
     doubts = doubtful_conventions(candidates)
     if doubts:
-        one_line(f"warning: {' | '.join(doubts)}")
+        notice(f"warning: {' | '.join(doubts)}")
 
 
-def write_files(*jobs: tuple[Path | None, Callable[[Path], None]]) -> tuple[list[Path], bool]:
-    """Writes one file after the other; what cannot be written is told on standard error and keeps no other back.
+def write_files(*jobs: tuple[Path | None, Callable[[Path], None]]) -> tuple[list[Path], list[str]]:
+    """Writes one file after the other; one that cannot be written keeps no other back.
 
     Args:
         jobs: File, None where it is not wanted, and what writes it.
 
     Returns:
-        The files that were written, and whether any could not be.
+        The files that were written, and what is wrong with others, a phrase for each reason.
 
     Raises:
         KeyboardInterrupt: Ctrl-C came while one of them was written, which is whole then.
     """
-    written, failed = [], False
+    written: list[Path] = []
+    failed: dict[str, list[str]] = {}
     for path, write in jobs:
         if path is None:
             continue
@@ -104,6 +121,20 @@ def write_files(*jobs: tuple[Path | None, Callable[[Path], None]]) -> tuple[list
             written.append(path)
             signals.note_written(path)
         except OSError as error:
-            one_line(f"{path}: cannot be written ({error.strerror or error})")
-            failed = True
-    return written, failed
+            failed.setdefault(str(error.strerror or error), []).append(str(path))
+    return written, [f"{', '.join(paths)}: cannot be written ({reason})" for reason, paths in failed.items()]
+
+
+def conclude(complaint: str, unwritten: Sequence[str], code: int = 130) -> None:
+    """Ends a command after all that it could write and print, where something is left to complain about.
+
+    Args:
+        complaint: Why the work itself was not finished; empty where it was.
+        unwritten: What is wrong with files that could not be written.
+        code: The exit code with a complaint.
+
+    Raises:
+        CommandError: There is a complaint, or a file that could not be written.
+    """
+    if complaint or unwritten:
+        raise CommandError("; ".join(filter(None, (complaint, *unwritten))), code if complaint else 2)

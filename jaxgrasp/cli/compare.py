@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from jaxgrasp.cli.checks import Skipped, check_output, warn_of_conventions, write_files
+from jaxgrasp.cli.checks import Skipped, check_output, conclude, warn_of_conventions, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.scene import ComparedScene
@@ -95,10 +95,10 @@ class Compare(Reading):
         """Computes, writes and prints.
 
         Returns:
-            The exit code: 0, or 2 where a file could not be written in the end, or was passed over.
+            The exit code: 0, or 2 where a file was passed over.
 
         Raises:
-            CommandError: The options or the files cannot be used.
+            CommandError: The options or the files cannot be used, or a file could not be written in the end.
         """
         names = metric_names(self.metric) or [
             name for name in DEFAULT if name != "task_wrench" or self.disturbances not in ("ball", "box")
@@ -137,13 +137,14 @@ class Compare(Reading):
         except ValueError as error:
             raise CommandError(str(error)) from error
 
-        written, failed = write_files(
+        written, unwritten = write_files(
             (self.output, lambda path: _write_table(found, path)),
             (self.figure, lambda path: write_figure(figure_of_comparison(found, outcome=outcome), path)),
         )
         with printing():
             print_comparison(found, outcome, len(candidates), written)
-        return 2 if failed else skipped.exit_code()
+        conclude("", unwritten)
+        return skipped.exit_code()
 
     def _check(self) -> None:
         checks = [

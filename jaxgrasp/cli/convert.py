@@ -1,7 +1,6 @@
 """`jaxgrasp convert`: grasps of any format that is read, in one that is written."""
 
 import math
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,11 +8,11 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import Skipped, check_options
+from jaxgrasp.cli.checks import Skipped, check_options, check_output, check_output_folder
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.setting import Reading
-from jaxgrasp.cli.streams import one_line, printing
-from jaxgrasp.storage import check_writable, reason_of
+from jaxgrasp.cli.streams import notice, printing
+from jaxgrasp.storage import reason_of
 
 _FILES = {"jaxgrasp": (".npz",), "isaac_grasp": (".yaml", ".yml")}
 _FOLDERS = ("dexgraspbench", "isaac_grasp")
@@ -57,10 +56,11 @@ class Convert(Reading):
         """Reads, writes and prints.
 
         Returns:
-            The exit code: 0, 130 after Ctrl-C, 2 where a file was passed over.
+            The exit code: 0, or 2 where a file was passed over.
 
         Raises:
-            CommandError: The options or a file cannot be used, or the output cannot be written.
+            CommandError: The options or a file cannot be used, the output cannot be written, or Ctrl-C has ended the
+                work early.
         """
         from jaxgrasp.cli.hand_grasps import grasps_of_files
         from jaxgrasp.cli.report import counting_bar
@@ -91,8 +91,8 @@ class Convert(Reading):
 
                 lost = write_grasps(grasps, self.output, self.to, hand=self.hand, progress=show)
         except KeyboardInterrupt:
-            one_line(f"{signals.word()}: wrote {done:,} of {len(grasps):,} grasps to {self.output}")
-            return 130
+            early = f"{signals.word()}: wrote {done:,} of {len(grasps):,} grasps to {self.output}"
+            raise CommandError(early, 130) from None
         except ValueError as error:
             text = str(error)
             raise CommandError(f"--{text}" if text.startswith("hand: ") else text) from error
@@ -100,7 +100,7 @@ class Convert(Reading):
             raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
         signals.note_written(self.output)
         if lost:
-            one_line(f"{self.to} cannot say: {'; '.join(lost)}")
+            notice(f"{self.to} cannot say: {'; '.join(lost)}")
         with printing():
             print(f"written: {self.output} ({len(grasps):,} grasps)")
         return skipped.exit_code()
@@ -117,9 +117,7 @@ class Convert(Reading):
             raise CommandError("convert: got no files; wanted grasps to convert")
         endings = _FILES.get(plain, ())
         if self.output.suffix in endings:
-            if any(os.path.realpath(self.output) == os.path.realpath(path) for path in self.grasps):
-                raise CommandError(f"--output {self.output}: this file is read from; wanted another one")
-            self._check_writable(self.output)
+            check_output(self.output, "--output", endings, self.grasps)
         elif plain in _FOLDERS:
             self._check_folder()
         else:
@@ -130,13 +128,6 @@ class Convert(Reading):
         try:
             if self.output.is_dir() and any(self.output.iterdir()):
                 raise CommandError(f"--output {self.output}: got a folder with files in it; wanted a new or empty one")
-            self.output.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
-        self._check_writable(self.output / "0.npy")
-
-    def _check_writable(self, path: Path) -> None:
-        try:
-            check_writable(path)
-        except (OSError, ValueError) as error:
-            raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
+        check_output_folder(self.output)

@@ -1,7 +1,10 @@
-"""The error of a command that its caller can mend."""
+"""The error by which a command ends."""
 
 
 class CommandError(Exception):
-    """Something that the caller can mend, in one line."""
+    """Why a command ends with another exit code than 0, in one line: mostly something that the caller can mend."""
 
-    exit_code = 2
+    def __init__(self, message: str, exit_code: int = 2):
+        """Takes the line and the exit code."""
+        super().__init__(message)
+        self.exit_code = exit_code

@@ -11,12 +11,12 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import Skipped, check_options, check_output, write_files
+from jaxgrasp.cli.checks import Skipped, check_options, check_output, conclude, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.published import Published, one_line_error
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax
-from jaxgrasp.cli.streams import one_line, printing
+from jaxgrasp.cli.streams import notice, printing
 
 if TYPE_CHECKING:
     from jaxgrasp.evaluation import Evaluation
@@ -72,10 +72,11 @@ class Evaluate(Published):
         """Tries, writes and prints.
 
         Returns:
-            The exit code: 0, 130 after Ctrl-C, 2 where a file or an object could not be used or written.
+            The exit code: 0, or 2 where a file or an object was passed over.
 
         Raises:
-            CommandError: The options, the files or the hand cannot be used.
+            CommandError: The options, the files or the hand cannot be used, a file could not be written in the end, or
+                Ctrl-C has ended the work early.
         """
         from jaxgrasp.simulation.protocols import protocol_named
 
@@ -100,11 +101,11 @@ class Evaluate(Published):
         scores = self._scores(found, names) if names and len(found) else {}
         compared = self._compared(found, scores)
         written, unwritten = self._write(found, scores, compared)
-        if found.interrupted:
-            one_line(f"{signals.word()}: tried {len(found):,} of {len(grasps):,}")
         with printing():
             print_evaluation(found, compared, written)
-        return 130 if found.interrupted else 2 if unwritten else skipped.exit_code()
+        early = f"{signals.word()}: tried {len(found):,} of {len(grasps):,}" if found.interrupted else ""
+        conclude(early, unwritten)
+        return skipped.exit_code()
 
     def _check(self) -> None:
         from jaxgrasp.evaluation import TABLE_ENDINGS
@@ -149,11 +150,11 @@ class Evaluate(Published):
                 skipped=skipped if self.keep_going else None,
             )
         for line in found.said:
-            one_line(line)
+            notice(line)
         diverged = np.flatnonzero(found.outcome == "diverged")
         if len(diverged):
             some = ", ".join(found.grasps.source[diverged[:_TOLD]].tolist())
-            one_line(
+            notice(
                 f"the simulations of {len(diverged):,} grasps diverged and say nothing of them: {some}"
                 f"{' and others' if len(diverged) > _TOLD else ''}"
             )
@@ -190,31 +191,34 @@ class Evaluate(Published):
         tried = found.tried
         if not values or not len(set(found.held[tried].tolist())) == 2:
             if values:
-                one_line("no areas under ROC curves: no grasp holds, or all do")
+                notice("no areas under ROC curves: no grasp holds, or all do")
             return None
         values = {name: value[tried] for name, value in values.items()}
         return compare_metrics(values, found.held[tried], smaller_is_better=frozenset(smaller), seed=self.seed)
 
     def _write(
         self, found: "Evaluation", scores: dict[str, np.ndarray], compared: "MetricComparison | None"
-    ) -> tuple[list[Path], bool]:
+    ) -> tuple[list[Path], list[str]]:
         from jaxgrasp.evaluation import write_evaluation
         from jaxgrasp.viewer import write_figure
         from jaxgrasp.viewer.evaluation import figure_of_evaluation
 
         if not len(found):
-            return [], False
-        written, failed = write_files(
+            return [], []
+        written, unwritten = write_files(
             (self.output, lambda path: write_evaluation(found, path, scores)),
             (self.figure, lambda path: write_figure(figure_of_evaluation(found, compared), path)),
         )
         if found.interrupted or self.output is None:
-            return written, failed
+            return written, unwritten
         for row in np.flatnonzero(np.isin(found.outcome, ("lost", "diverged")))[: self.movies].tolist():
             path = self.output.with_name(f"{self.output.stem}-{row}.gif")
             # Many machines have nothing to render with: that is told, and no failure.
-            written += write_files((path, lambda path, row=row: self._film(found, row, path)))[0]
-        return written, failed
+            filmed, unfilmed = write_files((path, lambda path, row=row: self._film(found, row, path)))
+            written += filmed
+            for line in unfilmed:
+                notice(line)
+        return written, unwritten
 
     def _film(self, found: "Evaluation", row: int, path: Path) -> None:
         from jaxgrasp.evaluation import film

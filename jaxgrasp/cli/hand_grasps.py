@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxgrasp.cli.checks import Skipped
 from jaxgrasp.cli.errors import CommandError
-from jaxgrasp.cli.streams import one_line
+from jaxgrasp.cli.streams import notice
 from jaxgrasp.storage import FileError
 
 if TYPE_CHECKING:
@@ -74,11 +74,11 @@ def configurations(built: "Scene", grasps: "GraspSet", stage: str = "grasp") -> 
 
 
 def _tell(notes: Sequence[str]) -> None:
-    """Prints the first few on standard error."""
+    """Notes the first few."""
     for note in notes[:_NOTES]:
-        one_line(note)
+        notice(note)
     if len(notes) > _NOTES:
-        one_line(f"... and {len(notes) - _NOTES:,} more like these")
+        notice(f"... and {len(notes) - _NOTES:,} more like these")
 
 
 def _as_option(text: str) -> str:

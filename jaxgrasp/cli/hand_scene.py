@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxgrasp.cli.checks import check_options
 from jaxgrasp.cli.errors import CommandError
-from jaxgrasp.cli.streams import one_line
+from jaxgrasp.cli.streams import notice
 
 if TYPE_CHECKING:
     from jaxgrasp import hands
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 BUILT_IN = ("shadow_hand", "four_fingers")
 # Options that a scene of a file answers itself.
 _OF_BUILT = ("mass", "density", "torsional_friction", "condim", "gravity_vector", "table")
-# Warnings that were printed: scenes of several scales have the same ones.
-_SAID: set[str] = set()
 
 
 @functools.cache
@@ -159,7 +157,7 @@ class HandScene:
             raise CommandError(f"--{' '.join(str(error).split())}") from error
 
     def hand_of(self, scene: Any, friction: float | None, max_force: float | None) -> "HandObject":
-        """The hand and the object of a scene; what is not modelled is said once, on standard error.
+        """The hand and the object of a scene; what is not modelled is noted.
 
         Raises:
             CommandError: It cannot be used.
@@ -187,9 +185,7 @@ class HandScene:
         except (ValueError, OSError) as error:
             raise CommandError(f"{self.name}: {' '.join(str(error).split())}") from error
         for warning in told:
-            if str(warning.message) not in _SAID:
-                _SAID.add(str(warning.message))
-                one_line(str(warning.message))
+            notice(warning.message)
         return hand
 
     def hand_object(self, friction: float | None, max_force: float | None) -> "HandObject":

@@ -9,12 +9,12 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import Skipped, check_options, check_output, warn_of_conventions, write_files
+from jaxgrasp.cli.checks import Skipped, check_options, check_output, conclude, warn_of_conventions, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
-from jaxgrasp.cli.streams import one_line, printing
+from jaxgrasp.cli.streams import notice, printing
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -82,11 +82,11 @@ class Rank(Reading):
         """Ranks, writes and prints.
 
         Returns:
-            The exit code: 0, 130 after Ctrl-C, 1 after an error of the computation, 2 where a file could not be written
-            in the end, or was passed over.
+            The exit code: 0, or 2 where a file was passed over.
 
         Raises:
-            CommandError: The options or the files cannot be used.
+            CommandError: The options or the files cannot be used, or the work came to no good end: 130 after Ctrl-C, 1
+                after an error of the computation, 2 where a file could not be written in the end.
         """
         names = metric_names(self.metric)
         self._check()
@@ -110,7 +110,8 @@ class Rank(Reading):
         clock.lap()
         metrics = scores_of(candidates, names, disturbances, gravity=self.gravity, cone_edges=self.cone_edges)
         clock.lap("metrics" if metrics else "")
-        return self._rank(candidates, disturbances, unit, hands, metrics, clock) or skipped.exit_code()
+        self._rank(candidates, disturbances, unit, hands, metrics, clock)
+        return skipped.exit_code()
 
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
@@ -166,11 +167,11 @@ class Rank(Reading):
         hands: "list[HandObject]",
         metrics: dict[str, np.ndarray],
         clock: "Clock",
-    ) -> int:
+    ) -> None:
         from jaxgrasp.cli.report import print_ranking, progress_bar
         from jaxgrasp.ranking import RankingInterrupted, rank
 
-        exit_code, complaint = 0, ""
+        code, complaint = 0, ""
         try:
             with progress_bar(len(candidates), clock) as progress:
                 ranking = rank(
@@ -186,20 +187,17 @@ class Rank(Reading):
                 )
         except RankingInterrupted as interruption:
             ranking, reason = interruption.ranking, interruption.__cause__
-            exit_code = 130 if isinstance(reason, KeyboardInterrupt) else 1
-            what = signals.word() if exit_code == 130 else str(reason) or type(reason).__name__
+            code = 130 if isinstance(reason, KeyboardInterrupt) else 1
+            what = signals.word() if code == 130 else str(reason) or type(reason).__name__
             complaint = f"{what}: ranked {len(ranking.margin):,} of {len(candidates):,}"
             if len(ranking.margin) == 0:
-                one_line(complaint)
-                return exit_code
+                raise CommandError(complaint, code) from interruption
         clock.lap()
-        written, failed = self._write(ranking, unit, hands)
+        written, unwritten = self._write(ranking, unit, hands)
         zeros = self._why_zero(ranking, disturbances)
-        if complaint:
-            one_line(complaint)
         with printing():
             print_ranking(ranking, unit, clock, zeros, written)
-        return exit_code or (2 if failed else 0)
+        conclude(complaint, unwritten, code)
 
     def _why_zero(self, ranking: "Ranking", disturbances: "DisturbanceSet") -> list[str]:
         from jaxgrasp.ranking import is_zero, why_zero
@@ -212,7 +210,7 @@ class Rank(Reading):
             cone_edges=self.cone_edges,
         )
 
-    def _write(self, ranking: "Ranking", unit: str, hands: "list[HandObject]") -> tuple[list[Path], bool]:
+    def _write(self, ranking: "Ranking", unit: str, hands: "list[HandObject]") -> tuple[list[Path], list[str]]:
         from jaxgrasp.ranking import write_table
         from jaxgrasp.viewer import figure_of_ranking, write_figure
 
@@ -220,11 +218,15 @@ class Rank(Reading):
             held = self.of_hand.held(hands, ranking) if hands else None
             write_figure(figure_of_ranking(ranking, unit=unit, loaded=bool(self.gravity), held=held), path)
 
-        written, failed = write_files(
+        written, unwritten = write_files(
             (self.output, lambda path: write_table(ranking, path)), (self.figure, write_picture)
         )
         if hands and np.isfinite(ranking.effort).any():
             # Many machines have nothing to render with: that is told, and no failure.
-            drawn, _ = write_files((self.of_hand.picture, lambda path: self.of_hand.draw(hands, ranking, unit, path)))
+            drawn, undrawn = write_files(
+                (self.of_hand.picture, lambda path: self.of_hand.draw(hands, ranking, unit, path))
+            )
             written += drawn
-        return written, failed
+            for line in undrawn:
+                notice(line)
+        return written, unwritten

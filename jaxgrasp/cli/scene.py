@@ -11,7 +11,7 @@ import numpy as np
 from jaxgrasp.cli.checks import Skipped, check_options
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.hand_scene import HandScene
-from jaxgrasp.cli.streams import one_line
+from jaxgrasp.cli.streams import notice
 from jaxgrasp.storage import FileError, read_archive, read_array
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ class GivenScene(HandScene):
         few = int((touching < self.min_contacts).sum())
         deep = int((found.columns["penetration"] > self.max_penetration).sum())
         if not left.all():
-            one_line(
+            notice(
                 f"left out {int((~left).sum()):,} of {len(found):,} configurations: {few:,} with fewer than "
                 f"{self.min_contacts} contacts, {deep:,} deeper than {1e3 * self.max_penetration:g} mm"
             )
@@ -187,10 +187,10 @@ class GivenScene(HandScene):
     def _tell(self, found: "Candidates") -> None:
         """Says how contacts were made, and what --max-contacts left out."""
         points = "one contact" if self.points_per_link == 1 else f"up to {self.points_per_link} contacts"
-        one_line(f"{points} for each link within {1e3 * self.contact_distance:g} mm of the object")
+        notice(f"{points} for each link within {1e3 * self.contact_distance:g} mm of the object")
         out = found.columns["left_out"]
         if out.any():
-            one_line(
+            notice(
                 f"--max-contacts {self.max_contacts} leaves out links of {int((out > 0).sum()):,} configurations, "
                 f"{int(out.max())} at most"
             )

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import Skipped, check_options, check_output, write_files
+from jaxgrasp.cli.checks import Skipped, check_options, check_output, check_output_folder, conclude, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.published import Published, one_line_error
 from jaxgrasp.cli.setting import configure_jax
-from jaxgrasp.cli.streams import one_line, printing
-from jaxgrasp.storage import check_writable, reason_of
+from jaxgrasp.cli.streams import notice, printing
+from jaxgrasp.storage import made_folder
 
 if TYPE_CHECKING:
     from jaxgrasp.files import GraspSet
@@ -55,10 +55,11 @@ class Squeeze(Published):
         """Squeezes, writes and prints.
 
         Returns:
-            The exit code: 0, 130 after Ctrl-C, 2 where a file or an object could not be used or written.
+            The exit code: 0, or 2 where a file or an object was passed over.
 
         Raises:
-            CommandError: The options, the files or the hand cannot be used.
+            CommandError: The options, the files or the hand cannot be used, a file could not be written in the end, or
+                Ctrl-C has ended the work early.
         """
         self._check()
         configure_jax()
@@ -71,7 +72,7 @@ class Squeeze(Published):
         with one_line_error(self):
             hand, said = prepared_hand(self.hand, self.servo_gain)
         for line in said:
-            one_line(line)
+            notice(line)
         with one_line_error(self), stoppable_bar("squeezing grasps", len(grasps)) as progress:
             squeezed = squeeze_grasps(
                 grasps,
@@ -84,12 +85,12 @@ class Squeeze(Published):
                 progress=progress,
                 skipped=skipped if self.keep_going else None,
             )
-        written, failed = self._write(squeezed)
-        if signals.stopped():
-            one_line(f"{signals.word()}: squeezed {len(squeezed):,} of {len(grasps):,}")
+        written, unwritten = self._write(squeezed)
         with printing():
             _print(squeezed, written)
-        return 130 if signals.stopped() else 2 if failed else skipped.exit_code()
+        early = f"{signals.word()}: squeezed {len(squeezed):,} of {len(grasps):,}" if signals.stopped() else ""
+        conclude(early, unwritten)
+        return skipped.exit_code()
 
     def _check(self) -> None:
         from jaxgrasp.files import WRITTEN
@@ -106,13 +107,9 @@ class Squeeze(Published):
             check_options(("--format", self.format, self.format == "jaxgrasp", "a folder as --output for this format"))
             check_output(self.output, "--output", (_NPZ,), self.inputs)
             return
-        try:
-            self.output.mkdir(parents=True, exist_ok=True)
-            check_writable(self.output / "grasps.npz")
-        except OSError as error:
-            raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
+        check_output_folder(self.output)
 
-    def _write(self, squeezed: "GraspSet") -> tuple[list[Path], bool]:
+    def _write(self, squeezed: "GraspSet") -> tuple[list[Path], list[str]]:
         if self.output.suffix:
             jobs = [(self.output, squeezed)]
         else:
@@ -131,11 +128,12 @@ class Squeeze(Published):
         from jaxgrasp.files import write_grasps
 
         try:
-            lost = write_grasps(squeezed, path, self.format, hand=None if self.format == "jaxgrasp" else self.hand)
+            with made_folder(path.parent):
+                lost = write_grasps(squeezed, path, self.format, hand=None if self.format == "jaxgrasp" else self.hand)
         except ValueError as error:
             raise CommandError(f"--format {self.format}: {error}") from error
         if lost:
-            one_line(f"{self.format} cannot say: {'; '.join(lost)}")
+            notice(f"{self.format} cannot say: {'; '.join(lost)}")
 
 
 def _print(squeezed: "GraspSet", written: Sequence[Path]) -> None:

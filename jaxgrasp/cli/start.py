@@ -4,19 +4,22 @@ import sys
 from collections.abc import Sequence
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.streams import one_line, prepared, printing
+from jaxgrasp.cli.streams import one_line, prepared, printing, tell_notices
 
 
 def run(arguments: Sequence[str] | None) -> int:
     """Runs a command, see `jaxgrasp.cli.main`."""
     with signals.handled(), prepared():
-        code = _answer(arguments)
+        code, line = _answer(arguments)
         number = signals.received()
-        if number is None:
-            return code
-        if not signals.stopped():
-            one_line(signals.outcome())
-        return 128 + number
+        if number is not None:
+            code, line = 128 + number, line if signals.stopped() else signals.outcome()
+        # What goes well has notices to tell; what is refused or stopped says that in one line, and nothing else.
+        if line:
+            one_line(line)
+        else:
+            tell_notices()
+        return code
 
 
 def run_process() -> None:
@@ -30,7 +33,8 @@ def run_process() -> None:
     sys.exit(code)
 
 
-def _answer(arguments: Sequence[str] | None) -> int:
+def _answer(arguments: Sequence[str] | None) -> tuple[int, str]:
+    """Returns the exit code, and the line that tells why it is none of success."""
     from jaxgrasp.cli.errors import CommandError
     from jaxgrasp.cli.subcommands import parsed
     from jaxgrasp.storage import limited_to
@@ -40,15 +44,12 @@ def _answer(arguments: Sequence[str] | None) -> int:
         with printing():
             command = parsed(arguments)
         if command is None:
-            return 0
+            return 0, ""
         with limited_to(command.budget):
-            return command.run()
+            return command.run(), ""
     except CommandError as error:
-        one_line(error)
-        return error.exit_code
+        return error.exit_code, str(error)
     except MemoryError as error:
-        one_line(f"not enough memory {f'({error})' if str(error) else ''}")
-        return 2
+        return 2, f"not enough memory {f'({error})' if str(error) else ''}"
     except KeyboardInterrupt:
-        one_line(signals.outcome())
-        return 130
+        return 130, signals.outcome()

@@ -5,6 +5,9 @@ import os
 import sys
 from collections.abc import Iterator
 
+# In the order in which they came; a command that is refused says why, and none of them.
+_notices: dict[str, None] = {}
+
 
 def fill_closed_descriptors() -> None:
     """Opens the null device in place of standard streams that are closed: files would get their numbers otherwise."""
@@ -21,6 +24,7 @@ def prepared() -> Iterator[None]:
     import logging
     import warnings
 
+    _notices.clear()
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))
@@ -35,7 +39,7 @@ def prepared() -> Iterator[None]:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
             warnings.filterwarnings("default", message="jaxgrasp")
-            warnings.showwarning = lambda message, *_, **__: one_line(message)
+            warnings.showwarning = lambda message, *_, **__: notice(message)
         yield
 
 
@@ -45,6 +49,17 @@ def one_line(message: object) -> None:
 
     with contextlib.suppress(OSError):
         print(f"jaxgrasp: {printable(' '.join(str(message).split()))}", file=sys.stderr, flush=True)
+
+
+def notice(message: object) -> None:
+    """Keeps a message about work that goes on; `tell_notices` prints it once, however often it comes."""
+    _notices[str(message)] = None
+
+
+def tell_notices() -> None:
+    """Prints what was kept, each message as `one_line` does."""
+    for message in _notices:
+        one_line(message)
 
 
 @contextlib.contextmanager

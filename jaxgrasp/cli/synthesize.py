@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import check_options, check_output, write_files
+from jaxgrasp.cli.checks import check_options, check_output, conclude, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
-from jaxgrasp.cli.streams import one_line, printing
+from jaxgrasp.cli.streams import printing
 from jaxgrasp.cli.synthesize_hand import SceneSynthesis
 from jaxgrasp.storage import atomic_write, printable
 
@@ -89,10 +89,11 @@ class Synthesize(Reading):
         """Synthesises, writes and prints.
 
         Returns:
-            The exit code: 0, or 2 where a file could not be written in the end.
+            The exit code: 0.
 
         Raises:
-            CommandError: The options or the files cannot be used.
+            CommandError: The options or the files cannot be used, a file could not be written in the end, or Ctrl-C has
+                ended the work early.
         """
         self._check()
         configure_jax()
@@ -110,13 +111,12 @@ class Synthesize(Reading):
         found = self._synthesize(shape, centre, disturbances)
         from jaxgrasp.cli.report import print_synthesis
 
-        written, failed = self._write(found, shape, name, unit)
+        written, unwritten = self._write(found, shape, name, unit)
         zeros = self._why_zero(found, disturbances)
-        if found.interrupted:
-            one_line(f"{signals.word()}: grasps are those of fewer steps")
         with printing():
             print_synthesis(found, name, note, unit, zeros, written)
-        return 130 if found.interrupted else 2 if failed else 0
+        conclude(f"{signals.word()}: grasps are those of fewer steps" if found.interrupted else "", unwritten)
+        return 0
 
     def _check(self) -> None:
         span = math.inf if self.span is None else self.span
@@ -170,7 +170,10 @@ class Synthesize(Reading):
         import jax
 
         mesh = geometry.Mesh.from_file(path, self.scale)
-        grid = mesh.to_grid()
+        try:
+            grid = mesh.to_grid()
+        except geometry.MeshError as error:
+            raise geometry.MeshError(f"{path}: {error}") from None
         points = np.asarray(geometry.sample_surface(grid, jax.random.key(self.seed), 4096))
         off = mesh.deviation(points) * 1e3
         note = (
@@ -214,7 +217,7 @@ class Synthesize(Reading):
             cone_edges=self.cone_edges,
         )
 
-    def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], bool]:
+    def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], list[str]]:
         import jax
         import numpy as np
 

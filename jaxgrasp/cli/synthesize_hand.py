@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import check_options, write_files
+from jaxgrasp.cli.checks import check_options, conclude, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.hand_scene import HandScene
-from jaxgrasp.cli.streams import one_line, printing
+from jaxgrasp.cli.streams import notice, printing
 from jaxgrasp.storage import atomic_write
 
 if TYPE_CHECKING:
@@ -90,10 +90,11 @@ class SceneSynthesis(HandScene):
             figure: The figure; None for none.
 
         Returns:
-            The exit code: 0, 130 after Ctrl-C, 2 where a file could not be written in the end.
+            The exit code: 0.
 
         Raises:
-            CommandError: The scene cannot be used.
+            CommandError: The scene cannot be used, a file could not be written in the end, or Ctrl-C has ended the work
+                early.
         """
         import jax
 
@@ -120,12 +121,12 @@ class SceneSynthesis(HandScene):
         kept = np.flatnonzero(found.good) if self.keep is None else found.diverse(self.keep, self.diversity)
         name = f"{self.name} and {object}" if self.hand else self._name
         columns = partial(_as_grasps, built, scale) if built else _as_configurations
-        written, failed = self._write(hand, found, found.take(kept), columns, name, unit, output, figure)
-        if found.interrupted:
-            one_line(f"{signals.word()}: grasps are those of fewer steps or starts")
+        written, unwritten = self._write(hand, found, found.take(kept), columns, name, unit, output, figure)
         with printing():
             print_hand_synthesis(found, len(kept), name, unit, written)
-        return 130 if found.interrupted else 2 if failed else 0
+        early = f"{signals.word()}: grasps are those of fewer steps or starts" if found.interrupted else ""
+        conclude(early, unwritten)
+        return 0
 
     @property
     def _name(self) -> str:
@@ -141,7 +142,7 @@ class SceneSynthesis(HandScene):
         unit: str,
         output: Path,
         figure: Path | None,
-    ) -> tuple[list[Path], bool]:
+    ) -> tuple[list[Path], list[str]]:
         from jaxgrasp.viewer import figure_of_hand_synthesis, write_figure
 
         def write_candidates(path: Path) -> None:
@@ -161,12 +162,15 @@ class SceneSynthesis(HandScene):
         if len(kept.qpos):
             jobs.insert(0, (output, write_candidates))
         else:
-            one_line(f"{output}: not written, no grasp is good")
-        written, failed = write_files(*jobs)
+            notice(f"{output}: not written, no grasp is good")
+        written, unwritten = write_files(*jobs)
         if len(kept.qpos):
             # Many machines have nothing to render with: that is told, and no failure.
-            written += write_files((self.picture, lambda path: self._draw(hand, kept, unit, path)))[0]
-        return written, failed
+            drawn, undrawn = write_files((self.picture, lambda path: self._draw(hand, kept, unit, path)))
+            written += drawn
+            for line in undrawn:
+                notice(line)
+        return written, unwritten
 
     def _draw(self, hand: "HandObject", kept: "HandSynthesis", unit: str, path: Path) -> None:
         from jaxgrasp.viewer.scene import draw_scenes

@@ -5,8 +5,9 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import mujoco
 import numpy as np
@@ -35,6 +36,7 @@ from jaxgrasp.simulation import (
 )
 
 T = TypeVar("T")
+_UNUSABLE = Outcome(UNUSABLE, NOTHING, np.nan, np.nan, (NOT_TRIED,) * LOADS)
 # s between two looks at what is done, in which a caller can stop.
 _PATIENCE = 0.2
 CONTROLS = "squeeze_controls"
@@ -128,10 +130,13 @@ def evaluate(
     found: dict[int, Outcome] = {}
     interrupted = False
     workers = workers or os.cpu_count() or 1
-    if isinstance(protocol.course, Course):
-        outcomes = _on_course(grasps, groups, protocol.course, spec, workers, skipped)
+    course = protocol.course
+    if isinstance(course, Course):
+        trial_of = partial(CourseTrial.of, course)
+        outcomes = _on_course(_prepared(grasps, groups, course, spec, trial_of, skipped), workers)
     else:
-        outcomes = _on_hold(grasps, groups, protocol.course, spec, workers, skipped)
+        hold_of = partial(HoldTrial.of, course, workers=workers)
+        outcomes = _on_hold(_prepared(grasps, groups, course, spec, hold_of, skipped))
     with quiet():
         try:
             for row, outcome in outcomes:
@@ -207,25 +212,41 @@ def _missing(grasps: GraspSet, protocol: Protocol) -> list[str]:
     return [f"the grasps have no {' and no '.join(missing)}: the grasp itself was taken for it"] if missing else []
 
 
-def _prepared(group: Group, skipped: Callable[[ValueError], None] | None, make: Callable[[], T]) -> T | None:
-    """What `make` makes for a group; None where it cannot and that is no reason to stop."""
-    try:
-        return make()
-    except ValueError as error:
-        if skipped is None:
-            raise
-        skipped(ValueError(f"{group.name}, scale {group.scale:g}: {error}"))
-        return None
+@dataclass(frozen=True)
+class _Prepared(Generic[T]):
+    """Grasps of one scene."""
+
+    grasps: GraspSet
+    rows: list[int]
+    """Which of all grasps they are."""
+    stages: dict[str, np.ndarray]
+    trial: T | None
+    """None where hand and object are not usable."""
 
 
-def _on_course(
+def _prepared(
     grasps: GraspSet,
     groups: list[Group],
-    course: Course,
+    course: Course | Hold,
     spec: mujoco.MjSpec,
-    workers: int,
+    trial_of: Callable[[Scene], T],
     skipped: Callable[[ValueError], None] | None,
-) -> Iterator[tuple[int, Outcome | None]]:
+) -> Iterator[_Prepared[T]]:
+    """Scene by scene, each made when the one before it is under way."""
+    for group in groups:
+        chosen, rows = grasps.take(group.rows), group.rows.tolist()
+        try:
+            scene = trial_scene(course, spec, group.object, group.scale)
+            stages, trial = stages_of(scene, chosen, course), trial_of(scene)
+        except ValueError as error:
+            if skipped is None:
+                raise
+            skipped(ValueError(f"{group.name}, scale {group.scale:g}: {error}"))
+            stages, trial = {}, None
+        yield _Prepared(chosen, rows, stages, trial)
+
+
+def _on_course(prepared: Iterator[_Prepared[CourseTrial]], workers: int) -> Iterator[tuple[int, Outcome | None]]:
     """Row by row as they are done; (-1, None) now and then while one waits."""
     own = threading.local()
 
@@ -246,54 +267,28 @@ def _on_course(
 
     pool = ThreadPoolExecutor(workers)
     try:
-        for group in groups:
-            chosen = grasps.take(group.rows)
-
-            def make(group: Group = group, chosen: GraspSet = chosen) -> tuple[CourseTrial, dict[str, np.ndarray]]:
-                trial = CourseTrial.of(course, trial_scene(course, spec, group.object, group.scale))
-                return trial, stages_of(trial.scene, chosen, course)
-
-            prepared = _prepared(group, skipped, make)
-            if prepared is None:
-                yield from ((row, _unusable()) for row in group.rows.tolist())
-                continue
-            trial, stages = prepared
-            for number, row in enumerate(group.rows.tolist()):
+        for part in prepared:
+            for number, row in enumerate(part.rows):
+                if part.trial is None:
+                    yield row, _UNUSABLE
+                    continue
                 yield from done(2 * workers)
-                running[pool.submit(run, trial, {name: x[number] for name, x in stages.items()})] = row
+                stages = {name: x[number] for name, x in part.stages.items()}
+                running[pool.submit(run, part.trial, stages)] = row
         yield from done(0)
     finally:
         # Those that have begun are short; the others are given up.
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _on_hold(
-    grasps: GraspSet,
-    groups: list[Group],
-    course: Hold,
-    spec: mujoco.MjSpec,
-    workers: int,
-    skipped: Callable[[ValueError], None] | None,
-) -> Iterator[tuple[int, Outcome | None]]:
+def _on_hold(prepared: Iterator[_Prepared[HoldTrial]]) -> Iterator[tuple[int, Outcome | None]]:
     """In tiles, each of which runs on all cores."""
-    for group in groups:
-        chosen = grasps.take(group.rows)
-
-        def make(group: Group = group, chosen: GraspSet = chosen) -> tuple[HoldTrial, dict[str, np.ndarray]]:
-            trial = HoldTrial.of(course, trial_scene(course, spec, group.object, group.scale), workers)
-            return trial, stages_of(trial.scene, chosen, course)
-
-        prepared = _prepared(group, skipped, make)
-        if prepared is None:
-            yield from ((row, _unusable()) for row in group.rows.tolist())
+    for part in prepared:
+        if part.trial is None:
+            yield from ((row, _UNUSABLE) for row in part.rows)
             continue
-        trial, stages = prepared
-        for number, outcome in trial.run(stages, chosen.columns.get(CONTROLS)):
-            yield int(group.rows[number]), outcome
-
-
-def _unusable() -> Outcome:
-    return Outcome(UNUSABLE, NOTHING, np.nan, np.nan, (NOT_TRIED,) * LOADS)
+        for number, outcome in part.trial.run(part.stages, part.grasps.columns.get(CONTROLS)):
+            yield part.rows[number], outcome
 
 
 def _evaluation(

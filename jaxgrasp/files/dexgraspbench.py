@@ -18,7 +18,7 @@ from jaxgrasp.files.given import Given
 from jaxgrasp.files.grasp_set import GRASP, GraspSet
 from jaxgrasp.files.pickling import write_pickled
 from jaxgrasp.files.scene_cfg import placed
-from jaxgrasp.storage import FileError
+from jaxgrasp.storage import FileError, made_folder
 
 NAME = "dexgraspbench"
 _GRASP = GRASP + STAGE
@@ -80,18 +80,18 @@ def write(grasps: GraspSet, folder: Path, progress: Callable[[int], None]) -> li
     Raises:
         OSError: A file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     table = columns_of_grasps(grasps)
     names = table.pop("joint_names", None)
     paths = table.pop("object_name", np.full(len(grasps), ""))
     # Whoever reads by name can; others take the order for that of the hand's file.
     same = {} if names is None else {"joint_names": names.tolist()}
     digits = len(str(max(0, len(grasps) - 1)))
-    for row in range(len(grasps)):
-        one = {name: _as_stored(name, column[row]) for name, column in table.items()}
-        one |= same | {"obj_path": str(paths[row])}
-        write_pickled(folder / f"{row:0{digits}}.npy", one, more_follow=row + 1 < len(grasps))
-        progress(row + 1)
+    with made_folder(folder):
+        for row in range(len(grasps)):
+            one = {name: _as_stored(name, column[row]) for name, column in table.items()}
+            one |= same | {"obj_path": str(paths[row])}
+            write_pickled(folder / f"{row:0{digits}}.npy", one, more_follow=row + 1 < len(grasps))
+            progress(row + 1)
     return [] if names is None else ["that joints are in another order than in the hand's file (--hand turns them)"]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxgrasp.files.frames import compose, invert, standing, unit
 from jaxgrasp.files.grasp_set import GRASP, GraspSet
 from jaxgrasp.files.isaac_grasp import JOINTS, NAME
-from jaxgrasp.storage import atomic_write, printable
+from jaxgrasp.storage import atomic_write, made_folder, printable
 
 ENDINGS = (".yaml", ".yml")
 _HEAD = (f"format: {NAME}", "format_version: 1.0", "object_frame_link: object", "gripper_frame_link: world")
@@ -42,12 +42,12 @@ def write(grasps: GraspSet, path: Path, progress: Callable[[int], None]) -> list
         _write_file(grasps, path, single=len(rows) == 1)
         progress(len(grasps))
         return [*lost, "that files have one object and scale (each grasp has its own)"] if len(rows) > 1 else lost
-    path.mkdir(parents=True, exist_ok=True)
     done = 0
-    for own, name in zip(rows.values(), _names(list(rows)), strict=True):
-        _write_file(grasps.take(np.array(own)), path / name, single=True)
-        done += len(own)
-        progress(done)
+    with made_folder(path):
+        for own, name in zip(rows.values(), _names(list(rows)), strict=True):
+            _write_file(grasps.take(np.array(own)), path / name, single=True)
+            done += len(own)
+            progress(done)
     return lost
 
 

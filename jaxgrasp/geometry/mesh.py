@@ -1,5 +1,6 @@
 """Triangle meshes from files, and the grids of their signed distances."""
 
+import functools
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from jaxtyping import Float, Int
 
 from jaxgrasp.geometry.grid import DistanceGrid
 from jaxgrasp.geometry.mesh_files import COSTS, TRIANGLE, read_triangles
+from jaxgrasp.geometry.triangle_tree import TriangleTree
 from jaxgrasp.geometry.triangles import signed_distances
 from jaxgrasp.storage import FileError, allowance, open_regular, printable, reason_of
 
@@ -106,8 +108,15 @@ class Mesh:
         return volumes @ centres / volumes.sum()
 
     def signed_distance(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
-        """Exact signed distances to all triangles, see `triangles.signed_distances`."""
-        return signed_distances(self.triangles, np.asarray(points, float))
+        """Exact signed distances to all triangles, see `triangles.signed_distances`.
+
+        Raises:
+            MeshError: too many triangles are long or overlap.
+        """
+        try:
+            return signed_distances(self._tree, np.asarray(points, float))
+        except ValueError as error:
+            raise MeshError(str(error)) from None
 
     def to_grid(self, nodes: int = 200_000) -> DistanceGrid:
         """The mesh as a shape: its signed distances on a grid, smoothly interpolated.
@@ -117,6 +126,7 @@ class Mesh:
 
         Raises:
             ValueError: fewer than 1,000 nodes.
+            MeshError: too many triangles are long or overlap.
         """
         if nodes < 1000:
             raise ValueError(f"nodes: got {nodes}, wanted at least 1000")
@@ -152,6 +162,10 @@ class Mesh:
         near = ~even & (np.abs(values) < _BAND * spacing)
         values[near] = exact(near)
         return values
+
+    @functools.cached_property
+    def _tree(self) -> TriangleTree:
+        return TriangleTree(self.vertices, self.faces)
 
     def _tetrahedra(self) -> tuple[np.ndarray, np.ndarray]:
         """Signed volumes and centres of the tetrahedra between the triangles and a point amid them."""

@@ -22,6 +22,7 @@ _Polygons = tuple[np.ndarray, np.ndarray, np.ndarray]
 COSTS, TRIANGLE = {"stl": 40, "ply": 40, "obj": 100}, 2048
 _LINE, _HEADER = 4096, 1 << 16
 _CORNER = re.compile(rb"^\s*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE | re.IGNORECASE)
+_FRACTION = re.compile(rb"^[ \t]*v(?:[ \t]+[^\s/]+){0,2}[ \t]+[^\s/]*/", re.MULTILINE)
 _LAST_LINE = re.compile(rb"^\s*endsolid\b[^\n]*\s*\Z", re.MULTILINE | re.IGNORECASE)
 _FACETS = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -78,6 +79,17 @@ def _check_lines(content: bytes) -> None:
         raise ValueError(f"a line of more than {_LINE:,} characters")
 
 
+def _plain(word: bytes) -> bytes:
+    """A number's text without what Python alone would read."""
+    if b"_" in word:
+        raise ValueError(f"a number {word.decode('latin-1')!r}")
+    return word
+
+
+def _number(word: bytes) -> float:
+    return float(_plain(word))
+
+
 def _stl(content: bytes) -> _Polygons:
     count = int.from_bytes(content[80:84], "little")
     # Some binary files begin with "solid", as text does: their length tells.
@@ -89,7 +101,7 @@ def _stl(content: bytes) -> _Polygons:
             raise ValueError("the file ends early")
         numbers = array("d")
         for corner in _CORNER.finditer(content):
-            numbers.extend(map(float, corner.groups()))
+            numbers.extend(map(_number, corner.groups()))
         corners = np.array(numbers).reshape(-1, 3)
     else:
         raise ValueError(f"{len(content):,} bytes where {count:,} triangles are declared")
@@ -107,6 +119,8 @@ def _stl(content: bytes) -> _Polygons:
 def _obj(content: bytes) -> _Polygons:
     _check_lines(content)
     points, corners, counts = array("d"), array("q"), array("q")
+    if _FRACTION.search(content):
+        raise ValueError("a vertex of fractions")
     # Of normals and textures nothing is kept.
     lines = iter(io.BytesIO(re.sub(rb"/\S*", b"", content)))
     for line in lines:
@@ -116,9 +130,9 @@ def _obj(content: bytes) -> _Polygons:
         if words[:1] == [b"v"]:
             if len(words) < 4:
                 raise ValueError("a vertex of fewer than three numbers")
-            points.extend(map(float, words[1:4]))
+            points.extend(map(_number, words[1:4]))
         elif words[:1] == [b"f"]:
-            indices = list(map(int, words[1:]))
+            indices = [int(_plain(word)) for word in words[1:]]
             if min(indices, default=0) <= 0:
                 # Counted backwards from the last vertex; 0 is none.
                 indices = [i if i >= 0 else len(points) // 3 + 1 + i for i in indices]
@@ -183,7 +197,7 @@ def _columns(
     for name, kind, length in element.properties:
         count = 1
         if length and element.rows:
-            count = int(np.frombuffer(data, order + length, 1, where)[0])
+            count = _whole(np.frombuffer(data, order + length, 1, where)[0])
             where += np.dtype(length).itemsize
             lengths.append((f"number of {name}", count))
             row.append((lengths[-1][0], order + length))
@@ -203,6 +217,12 @@ def _columns(
     return _uneven(data, at, element, order)
 
 
+def _whole(count: float) -> int:
+    if count != int(count):
+        raise ValueError("lists that have no whole number of corners")
+    return int(count)
+
+
 def _uneven(
     data: memoryview, at: int, element: _Element, order: str
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
@@ -218,7 +238,7 @@ def _uneven(
                 at += size
                 continue
             (count,) = length.unpack_from(data, at)
-            count, at = int(count), at + length.size
+            count, at = _whole(count), at + length.size
             if not 0 <= count <= len(data):
                 raise ValueError("lists that are longer than the file")
             values[name] += data[at : at + count * size]

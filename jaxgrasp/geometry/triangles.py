@@ -1,7 +1,7 @@
-"""Distances to many triangles by trying them all, and how often they wind around a point."""
+"""Distances to many triangles, and how often they wind around a point."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +9,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgrasp.compiling import compiled
+from jaxgrasp.geometry.triangle_tree import BLOCK, ROUNDING, Blocks, Pairs, TriangleTree
+from jaxgrasp.storage import allowance
 
-# Points at a time: the running results stay in registers and in the fastest cache.
-_CHUNK = 256
+# Pairs of a leaf and a block at a time: calls cost little then, and one program serves all meshes.
+_CHUNK, _FEW = 8192, 512
 # arctan(r) / r for 0 <= r <= 1 as a polynomial in r^2, highest power first: interpolated at Chebyshev's points.
 _ARCTAN = (
     0.0027662835,
@@ -25,54 +27,134 @@ _ARCTAN = (
     0.9999999818,
 )
 
+# Bytes of what may be read for each pair of a point and a leaf that are looked at: 27 million of them, which take less
+# than ten seconds. A surface of a million even triangles makes 23 million.
+_OF_PAIR = 80
+
 Vector = Sequence[Array] | Array
 
 
-def signed_distances(
-    triangles: Float[np.ndarray, "triangles 3 3"], points: Float[np.ndarray, "points 3"]
-) -> np.ndarray:
+def signed_distances(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) -> np.ndarray:
     """Signed distances of points to a surface of triangles, negative inside.
 
     Inside is where the generalised winding number, the solid angle under which the surface is seen over 4 pi, is above
     one half: holes, cracks and overlaps do no harm. Computed in single precision, relative to the surface's extent.
 
     Args:
-        triangles: (triangles, 3, 3), corners in counterclockwise order seen from outside, m.
+        tree: the triangles, corners in counterclockwise order seen from outside.
         points: (points, 3), m.
 
     Returns:
         (points,), m, float64.
+
+    Raises:
+        ValueError: too many triangles are long or overlap, so that distances would take long.
     """
-    centre = 0.5 * (triangles.min((0, 1)) + triangles.max((0, 1)))
-    extent = float(np.ptp(triangles, axis=(0, 1)).max())
-    scaled = jnp.asarray((triangles - centre) / extent, jnp.float32)
-    count = len(points)
-    chunks = max(1, math.ceil(count / _CHUNK))
-    size = math.ceil(count / chunks)
-    padded = np.pad((points - centre) / extent, [(0, chunks * size - count), (0, 0)], mode="edge")
-    tiles = jnp.asarray(padded.reshape(chunks, size, 3).swapaxes(1, 2), jnp.float32)
-    squared, turns = (np.asarray(part, float).reshape(-1)[:count] for part in _all_chunks(scaled, tiles))
-    return np.where(turns > 0.5, -1.0, 1.0) * np.sqrt(squared) * extent
+    blocks = Blocks.of(tree.scaled(points))
+    squared = np.full(blocks.points.shape[:2], np.inf, np.float32)
+    work = 0
+    for near in tree.nearest(blocks):
+        # Of a block's leaves, few have to do with each of its points.
+        least, most = _in_chunks(_squares_to_boxes, tree.boxes, blocks.points, near).swapaxes(0, 1)
+        _reduce(np.minimum, squared, near, most)
+        pair, place = np.nonzero(least <= (np.sqrt(squared) + ROUNDING)[near.blocks] ** 2)
+        own = Pairs(BLOCK * near.blocks[pair] + place, near.parts[pair])
+        work = _spent(work, len(near.blocks) + len(pair))
+        found = _in_chunks(_least_squares, tree.leaves, blocks.points.reshape(-1, 1, 3), own)
+        np.minimum.at(squared.reshape(-1), own.blocks, found[:, 0])
+    angles = np.zeros(blocks.points.shape[:2])
+    for near, far, level in tree.around(blocks):
+        work = _spent(work, BLOCK * len(near.blocks))
+        _reduce(np.add, angles, near, _in_chunks(_half_angles, tree.leaves, blocks.points, near))
+        dipoles = np.concatenate([level.middle, level.area], -1)
+        _reduce(np.add, angles, far, _in_chunks(_half_angles_of_dipoles, dipoles, blocks.points, far))
+    found = np.empty(len(points))
+    signs = np.where(angles > math.pi, -1.0, 1.0)
+    found[blocks.order] = (signs * np.sqrt(squared) * tree.extent).reshape(-1)[: len(points)]
+    return found
+
+
+def _spent(before: int, more: int) -> int:
+    """Adds pairs of points and leaves to those that were looked at before.
+
+    Raises:
+        ValueError: They are more than a surface makes.
+    """
+    if before + more > allowance() // _OF_PAIR:
+        raise ValueError(
+            "got too many triangles that are long or overlap, wanted evenly shaped ones (remesh it, see --read-limit)"
+        )
+    return before + more
+
+
+def _in_chunks(function: Callable[..., Array], parts: np.ndarray, points: np.ndarray, pairs: Pairs) -> np.ndarray:
+    """A function of parts and of blocks of points for all pairs of them, (pairs, ...)."""
+    found, begin = [], 0
+    # At least one chunk tells the shape.
+    while begin < max(1, len(pairs.blocks)):
+        size = _CHUNK if len(pairs.blocks) - begin > _CHUNK // 4 else _FEW
+        own, places = (x[begin : begin + size] for x in pairs)
+        missing, begin = size - len(own), begin + size
+        own, places = np.pad(own, (0, missing)), np.pad(places, (0, missing))
+        found.append(np.asarray(function(parts[places], points[own]))[: size - missing])
+    return np.concatenate(found)
+
+
+def _reduce(combine: np.ufunc, results: np.ndarray, pairs: Pairs, values: np.ndarray) -> None:
+    """Combines the values of each block's pairs with what the block has."""
+    if len(pairs.blocks):
+        starts = np.flatnonzero(np.diff(pairs.blocks, prepend=-1))
+        own = pairs.blocks[starts]
+        results[own] = combine(results[own], combine.reduceat(values, starts))
 
 
 @compiled
-def _all_chunks(
-    triangles: Float[Array, "triangles 3 3"], tiles: Float[Array, "chunks 3 points"]
-) -> tuple[Array, Array]:
-    """Squared distances and winding numbers, (chunks, points) each."""
+def _squares_to_boxes(boxes: Float[Array, "pairs 3 3"], points: Float[Array, "pairs block 3"]) -> Array:
+    """Squares of how near to each point what is in a box may be, and of how near it is at most, (pairs, 2, block)."""
+    places, (lower, upper, inside) = points.transpose(2, 1, 0), boxes.transpose(1, 2, 0)
+    outside = [jnp.maximum(jnp.maximum(lower[k] - places[k], places[k] - upper[k]), 0) for k in range(3)]
+    away = _subtract(inside, places)
+    return jnp.stack([_dot(outside, outside), _dot(away, away)]).transpose(2, 0, 1)
 
-    def nearest(points: Array) -> tuple[Array, Array]:
 
-        def compare(best: tuple[Array, Array], triangle: Array) -> tuple[tuple[Array, Array], None]:
-            corners = [_subtract(corner, points) for corner in triangle]
-            squared, angle = best
-            return (jnp.minimum(squared, _squared_distance(*corners)), angle + _half_angle(*corners)), None
+@compiled
+def _least_squares(
+    triangles: Float[Array, "pairs leaf 3 3"], points: Float[Array, "pairs block 3"]
+) -> Float[Array, "pairs block"]:
+    """Squared distances of points to the nearest of the triangles."""
+    return _over_triangles(
+        lambda best, corners: jnp.minimum(best, _squared_distance(*corners)), jnp.inf, triangles, points
+    )
 
-        zero = jnp.zeros_like(points[0])
-        (squared, angle), _ = lax.scan(compare, (zero + jnp.inf, zero), triangles)
-        return squared, angle / (2 * math.pi)
 
-    return lax.map(nearest, tiles)
+@compiled
+def _half_angles(
+    triangles: Float[Array, "pairs leaf 3 3"], points: Float[Array, "pairs block 3"]
+) -> Float[Array, "pairs block"]:
+    """Sums of half the solid angles of triangles."""
+    return _over_triangles(lambda angle, corners: angle + _half_angle(*corners), 0.0, triangles, points)
+
+
+def _over_triangles(
+    combine: Callable[[Array, list[Vector]], Array], start: float, triangles: Array, points: Array
+) -> Array:
+    # Pairs trail: they fill the vectors.
+    places = points.transpose(2, 1, 0)
+
+    def step(found: Array, triangle: Array) -> tuple[Array, None]:
+        return combine(found, [_subtract(corner, places) for corner in triangle]), None
+
+    found, _ = lax.scan(step, jnp.full_like(places[0], start), triangles.transpose(1, 2, 3, 0))
+    return found.T
+
+
+@compiled
+def _half_angles_of_dipoles(dipoles: Float[Array, "pairs 6"], points: Float[Array, "pairs block 3"]) -> Array:
+    """Half the solid angles of small surfaces far away: their middles, and their normals as long as their areas."""
+    places, (middle, area) = points.transpose(2, 1, 0), dipoles.T.reshape(2, 3, -1)
+    arm = _subtract(middle, places)
+    squared = _dot(arm, arm)
+    return (0.5 * _dot(arm, area) / (squared * jnp.sqrt(squared))).T
 
 
 def _squared_distance(a: Vector, b: Vector, c: Vector) -> Array:

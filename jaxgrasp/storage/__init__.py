@@ -13,7 +13,7 @@ from jaxgrasp.storage.arrays import (
 )
 from jaxgrasp.storage.cache import cache_folder
 from jaxgrasp.storage.reading import FileError, allowance, limited_to, open_regular, printable, reason_of
-from jaxgrasp.storage.writing import atomic_write, check_writable, discard_unfinished, unfinished
+from jaxgrasp.storage.writing import atomic_write, check_writable, discard_unfinished, made_folder, unfinished
 
 __all__ = [
     "PICKLE_COST",
@@ -27,6 +27,7 @@ __all__ = [
     "check_writable",
     "discard_unfinished",
     "limited_to",
+    "made_folder",
     "open_archive",
     "open_regular",
     "printable",

@@ -20,6 +20,7 @@ except ImportError:  # Windows, where nobody can remove a file that somebody has
 
 _PREFIX, _SUFFIX = ".jaxgrasp-", ".part"
 _unfinished: set[Path] = set()
+_made_folders: list[Path] = []
 
 
 @contextlib.contextmanager
@@ -60,6 +61,36 @@ def atomic_write(path: Path | str, *, more_follow: bool = False) -> Iterator[Bin
         _make_lasting(target.parent)
 
 
+@contextlib.contextmanager
+def made_folder(folder: Path | str) -> Iterator[None]:
+    """Makes a folder, and those above it; of these, what is still empty at the end of the block is removed.
+
+    Raises:
+        OSError: It cannot be made, or there is something else of this name.
+    """
+    folder = Path(folder)
+    made: list[Path] = []
+    try:
+        for each in reversed([folder, *folder.parents]):
+            if each.is_dir():
+                continue
+            try:
+                each.mkdir()
+            except FileExistsError:
+                # Another process may have made it in between.
+                if not each.is_dir():
+                    raise
+                continue
+            made.append(each)
+            _made_folders.append(each)
+        yield
+    finally:
+        for each in reversed(made):
+            _made_folders.remove(each)
+            with contextlib.suppress(OSError):
+                each.rmdir()
+
+
 def check_writable(path: Path | str) -> None:
     """Finds out whether a file can be written, and leaves everything as it was.
 
@@ -79,10 +110,13 @@ def unfinished() -> bool:
 
 
 def discard_unfinished() -> None:
-    """Removes the files that this process is writing: for a process that ends at once."""
+    """Removes the files that this process is writing, and empty folders for them: for a process that ends at once."""
     for part in tuple(_unfinished):
         with contextlib.suppress(OSError):
             part.unlink()
+    for folder in reversed(_made_folders):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def _target(path: Path | str) -> Path:

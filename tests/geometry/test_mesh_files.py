@@ -1,5 +1,6 @@
 """Triangles of files, against trimesh's readers and writers; damaged and absurd ones."""
 
+import re
 import struct
 import time
 
@@ -125,3 +126,13 @@ def test_triangles_are_as_many_as_the_budget_allows(tmp_path):
         Mesh.from_file(path)
     with limited_to(len(coloured().faces) * 2048 - 1), pytest.raises(MeshError, match="319 are allowed"):
         Mesh.from_file(path)
+
+
+@pytest.mark.parametrize("kind", ["stl", "obj"])
+@pytest.mark.parametrize("number", ["1_0", "1/20", "0x1", "1,5"])
+def test_numbers_are_those_of_the_format(kind, number):
+    made = trimesh.creation.box((10, 10, 10)).apply_translation((5, 5, 5))
+    text = made.export(file_type="stl_ascii" if kind == "stl" else "obj")
+    spoilt = re.sub(r"(?m)^(\s*v(?:ertex)? +)\S+", rf"\g<1>{number}", text, count=1)
+    with pytest.raises(ValueError):
+        read_triangles(spoilt.encode(), kind, MOST)
