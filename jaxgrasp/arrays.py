@@ -97,8 +97,13 @@ def safe_norm(x: jax.Array, axis: int = -1) -> jax.Array:
 def frames_from_normals(normals: jax.Array) -> jax.Array:
     """Make contact frames (t1, t2, n): the x and y axes turned by the smallest rotation that takes z to n.
 
-    The rule is smooth but at n = -z, where it is the half turn about y. Margins of coarse friction pyramids depend on
-    the tangents, so give frames of your own where these matter.
+    Within 45 degrees of -z, where that rule ends in a direction from which rounding would choose, the tangents turn
+    about n besides, and are (-x, y) at n = -z. No field of tangents is continuous on the whole sphere. This one is
+    twice differentiable but at two directions that no common solid has as a normal: 25.8 degrees from -z, n =
+    (-0.0871, +-0.4267, -0.9002); there it is the smallest rotation that takes -z to n, of (-x, y).
+
+    Margins of coarse friction pyramids depend on the tangents, so take more edges or give frames of your own where
+    these matter.
 
     Args:
         normals: (*batch, 3), any positive length.
@@ -114,15 +119,33 @@ def frames_from_normals(normals: jax.Array) -> jax.Array:
     scaled = safe / jax.lax.stop_gradient(jnp.where(usable, largest, 1))
     n = scaled / safe_norm(scaled)[..., None]
     x, y, z = n[..., 0], n[..., 1], n[..., 2]
-    # 1 / (1 + z), without cancellation where z is near -1.
-    upper = z >= 0
-    level = x * x + y * y
-    inverse = jnp.where(upper, 1 / jnp.where(upper, 1 + z, 1), safe_divide(1 - z, jnp.where(upper, 1, level)))
-    down = (~upper) & (level == 0)
-    t1 = jnp.stack([jnp.where(down, -1, 1 - x * x * inverse), -x * y * inverse, -x], -1)
-    t2 = jnp.stack([-x * y * inverse, 1 - y * y * inverse, -y], -1)
-    frames = jnp.stack([t1, t2, n], -1)
+    low = -z > _LOW
+    inverse = 1 / (1 + jnp.where(low, -z, z))
+    # The smallest rotation, of (x, y) from z or of (-x, y) from -z.
+    sign = jnp.where(low, -1, 1)
+    t1 = jnp.stack([sign - sign * x * x * inverse, -sign * x * y * inverse, -x], -1)
+    t2 = jnp.stack([-x * y * inverse, 1 - y * y * inverse, -sign * y], -1)
+    turn = jnp.stack(_turn_near_minus_z(x, y, z), -1)
+    length = safe_norm(turn)
+    turn = safe_divide(turn, length[..., None])
+    cosine, sine = jnp.where(low & (length > 0), turn[..., 0], 1)[..., None], jnp.where(low, turn[..., 1], 0)[..., None]
+    frames = jnp.stack([cosine * t1 - sine * t2, sine * t1 + cosine * t2, n], -1)
     return jnp.where(usable[..., None], frames, jnp.nan)
+
+
+# Normals with -z above this are less than 45 degrees from -z.
+_LOW = 0.5**0.5
+
+
+def _turn_near_minus_z(x: jax.Array, y: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Real and imaginary part of a number whose argument is the angle between tangents and smallest rotation from -z.
+
+    With w = x + i y the smallest rotation from z is that from -z turned by the argument of w^2, which goes around twice
+    about -z. The number is w^2 + 0.32 h w + 0.64 h^2, where h rises from 0 at 45 degrees from -z, with two derivatives,
+    to 2 at -z: the zero at w = 0 becomes two, where w / h = -0.16 +- 0.784 i. The tangents hardly turn at -z.
+    """
+    h = jnp.clip((-z - _LOW) / (1 - _LOW), 0, 1) ** 3 * (1 - z)
+    return x * x - y * y + 0.32 * h * x + 0.64 * h * h, y * (2 * x + 0.32 * h)
 
 
 def fold(op: Callable[[jax.Array, jax.Array], jax.Array], parts: Iterable[jax.Array]) -> jax.Array:

@@ -21,6 +21,7 @@ from jaxgrasp.robustness import (
     least_effort,
     least_total_effort,
     specified_disturbances,
+    weighted_pseudo_inverse,
     worst_case,
 )
 from jaxgrasp.solvers.status import Status
@@ -57,6 +58,7 @@ __all__ = [
     "solvers",
     "specified_disturbances",
     "squeeze_grasps",
+    "weighted_pseudo_inverse",
     "without_kernels",
     "worst_case",
 ]

@@ -95,7 +95,10 @@ class Contacts:
         max_force: ArrayLike,
         active: ArrayLike | None = None,
     ) -> "Contacts":
-        """Contacts whose tangents do not matter: x and y turned by the smallest rotation that takes z to the normal.
+        """Contacts whose tangents follow from the normals, by a rule that rounding does not change.
+
+        They are x and y turned by the smallest rotation that takes z to the normal n. Within 45 degrees of n = -z they
+        turn about n besides, and are (-x, y) at n = -z; see `jaxgrasp.arrays.frames_from_normals`.
 
         Args:
             positions: (*batch, n_c, 3), m, object frame, about the centre of mass.

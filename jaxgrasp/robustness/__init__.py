@@ -1,7 +1,7 @@
 """The paper: worst cases (17)-(18), margin (21), least effort (22), blocking forces (15), and the way to them."""
 
 from jaxgrasp.robustness.auditing import audit
-from jaxgrasp.robustness.blocking import blocking_forces
+from jaxgrasp.robustness.blocking import blocking_forces, weighted_pseudo_inverse
 from jaxgrasp.robustness.chain.comparison import (
     Comparison,
     SpecifiedDisturbances,
@@ -30,5 +30,6 @@ __all__ = [
     "least_effort",
     "least_total_effort",
     "specified_disturbances",
+    "weighted_pseudo_inverse",
     "worst_case",
 ]

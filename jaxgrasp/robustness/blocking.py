@@ -1,9 +1,10 @@
-"""Blocking forces: how the fingers answer while a disturbance acts, (14)-(15)."""
+"""Blocking forces: how the fingers answer while a disturbance acts, (14)-(15), and the G* that they come from."""
 
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -38,6 +39,55 @@ def blocking_forces(
     """
     data = GraspData.from_arguments(contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
     return over_grasps(_BlockingForces(), data)
+
+
+def weighted_pseudo_inverse(
+    contacts: Contacts, compliance: ArrayLike | Compliance | None = None
+) -> Float[Array, "*batch rows 6"]:
+    """The weighted pseudo-inverse G* = Q^-1 G' (G Q^-1 G')^+ of the grasp map (15).
+
+    G* W are the contact forces that supply the wrench W with the least f' Q f. On a rank-deficient grasp that holds for
+    wrenches in the range of G; of others G* takes the part in the range, projected with moments in units of the
+    root-mean-square distance of the contacts from the centre of mass.
+
+    Args:
+        contacts: the grasps.
+        compliance: Q of (14), contact frames: None for the identity, (*batch, n_c, 3, 3) blocks by contact or
+            (*batch, 3 n_c, 3 n_c) full, symmetric positive definite; n_d of them with `Compliance.per_direction`.
+
+    Returns:
+        (*batch, 3 n_c, 6), contact by contact in contact frames, from N and N m in the object frame to N; (*batch, n_d,
+        3 n_c, 6) for one Q a direction. Rows of absent contacts are 0; NaN where the data are not admissible.
+
+    Raises:
+        ValueError: shapes that do not fit.
+
+    Derivatives:
+        Of any order with respect to positions, frames and compliance, while the rank of G stays.
+    """
+    still = np.zeros((1, 6))
+    if isinstance(compliance, Compliance):
+        # Blocks have an axis more than full matrices, which are larger than 3 by 3 but for single contacts.
+        shape = compliance.per_vertex.shape
+        still = np.zeros((shape[-4 if len(shape) > 3 and shape[-1] == 3 else -3], 6))
+    found = over_grasps(_PseudoInverse(), contacts, DisturbanceSet.vertices(still), compliance=compliance)
+    return found.reshape(*found.shape[:-3], -1, 6)
+
+
+@dataclass(frozen=True)
+class _PseudoInverse(Plain):
+    rows = 18
+
+    def evaluate(self, grasps: Grasps) -> jax.Array:
+        # (3, 6, n, *lanes) to (n, 3, 6, *lanes); its columns take newtons alone.
+        blocks = lambda half: jnp.moveaxis(pseudo_inverse(grasps.columns, half)[0], 2, 0) * grasps.units
+        if grasps.vertex_halves is None:
+            inverses = blocks(grasps.half)
+            present = grasps.present[:, None, None]
+        else:
+            inverses = jax.lax.map(blocks, grasps.vertex_halves)
+            present = grasps.present[None, :, None, None]
+        return jnp.where(grasps.valid, jnp.where(present > 0, inverses, 0), jnp.nan)
 
 
 @dataclass(frozen=True)
