@@ -70,7 +70,8 @@ def weighted_pseudo_inverse(
         # Blocks have an axis more than full matrices, which are larger than 3 by 3 but for single contacts.
         shape = compliance.per_vertex.shape
         still = np.zeros((shape[-4 if len(shape) > 3 and shape[-1] == 3 else -3], 6))
-    found = over_grasps(_PseudoInverse(), contacts, DisturbanceSet.vertices(still), compliance=compliance)
+    data = GraspData.from_arguments(contacts, DisturbanceSet.vertices(still), compliance=compliance)
+    found = over_grasps(_PseudoInverse(), data)
     return found.reshape(*found.shape[:-3], -1, 6)
 
 
@@ -80,12 +81,12 @@ class _PseudoInverse(Plain):
 
     def evaluate(self, grasps: Grasps) -> jax.Array:
         # (3, 6, n, *lanes) to (n, 3, 6, *lanes); its columns take newtons alone.
-        blocks = lambda half: jnp.moveaxis(pseudo_inverse(grasps.columns, half)[0], 2, 0) * grasps.units
-        if grasps.vertex_halves is None:
-            inverses = blocks(grasps.half)
+        blocks = lambda root: jnp.moveaxis(pseudo_inverse(grasps.columns, root)[0], 2, 0) * grasps.units
+        if grasps.vertex_inverse_roots is None:
+            inverses = blocks(grasps.inverse_root)
             present = grasps.present[:, None, None]
         else:
-            inverses = jax.lax.map(blocks, grasps.vertex_halves)
+            inverses = jax.lax.map(blocks, grasps.vertex_inverse_roots)
             present = grasps.present[None, :, None, None]
         return jnp.where(grasps.valid, jnp.where(present > 0, inverses, 0), jnp.nan)
 
