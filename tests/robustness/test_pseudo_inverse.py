@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
-from test_identities import compliances, sample
+from problems import sample
+from test_identities import compliances
 
 import jaxgrasp as jg
 
