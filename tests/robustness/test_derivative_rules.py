@@ -53,6 +53,22 @@ def test_mapped_gradients_are_those_of_the_batch(gradient):
     np.testing.assert_allclose(nested.reshape(8, 4, 3), gradient(positions), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["13", "16", "per_direction", "total effort"])
+def test_formulations_vary_forwards_as_backwards(name):
+    positions, along = jnp.asarray(ball_grasps(5)), jnp.asarray(ball_grasps(5, seed=4))
+
+    def value(positions):
+        contacts = contacts_on_ball(positions)
+        if name == "total effort":
+            return jg.least_total_effort(contacts, FORCES, 0.5, cone_edges=4).effort
+        return jg.formulation_margin(contacts, FORCES, name, cone_edges=4).margin
+
+    forwards = jax.jit(lambda p: jax.jvp(value, (p,), (along,))[1], compiler_options=QUICK)(positions)
+    backwards = jax.jit(jax.grad(lambda p: jnp.nansum(value(p))), compiler_options=QUICK)(positions)
+    assert np.count_nonzero(forwards) >= 3
+    np.testing.assert_allclose(forwards, jnp.sum(backwards * along, (1, 2)), rtol=1e-9)
+
+
 def test_kinks_have_valid_subgradients(gradient):
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
     rng = np.random.default_rng(8)

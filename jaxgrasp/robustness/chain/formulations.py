@@ -283,9 +283,11 @@ class Chain(Audited):
         _, scaled = self._scaled(grasps)
         weights, points = {}, {}
         for name, (solution, point) in held.items():
-            weight = _program_weights(solution, cotangents[name], scaled[self._twin(name)], FORMULATIONS[name])
-            weights[name] = weight
-            points[name] = jax.tree.map(lambda x, weight=weight: jnp.where(weight != 0, x, 0), point)
+            given = scaled[self._twin(name)], FORMULATIONS[name]
+            weights[name] = _program_weights(solution, cotangents[name], *given)
+            # Nothing but the weights may depend on the cotangents, in which the adjoint is linear.
+            counted = _program_weights(solution, (None, jnp.ones_like(solution.directions)), *given) != 0
+            points[name] = jax.tree.map(lambda x, counted=counted: jnp.where(counted, x, 0), point)
 
         def value(grasps: Grasps) -> jax.Array:
             _, scaled = self._scaled(grasps)

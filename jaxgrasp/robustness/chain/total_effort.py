@@ -217,8 +217,9 @@ class _TotalEffort(OfPyramids, Audited):
 
     def _adjoint(self, grasps: Grasps, held: tuple, cotangents: tuple) -> Grasps:
         solution, record = held
-        weight = jnp.where(jnp.isfinite(solution.effort), cotangents[0], 0)
-        record = jax.tree.map(lambda x: jnp.where(weight != 0, x, 0), record)
+        solved = jnp.isfinite(solution.effort)
+        weight = jnp.where(solved, cotangents[0], 0)
+        record = jax.tree.map(lambda x: jnp.where(solved, x, 0), record)
 
         def value(grasps: Grasps) -> jax.Array:
             problem, unit = _problem(grasps, compute_basics(grasps, False), self.cone_edges, record.x)
