@@ -6,6 +6,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.contact.row_space import Basis, dot, row_basis
 from jaxgrasp.lanes.fence import each, fenced
@@ -62,11 +63,9 @@ def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array
 @jax.custom_jvp
 def _inverse_root(matrices: jax.Array) -> tuple[jax.Array, jax.Array]:
     """M with M M' = Q^-1 for Q (..., k, k), and whether Q is positive definite; the identity where it is not."""
-    lower = jnp.linalg.cholesky(matrices, symmetrize_input=True)
-    sound = jnp.isfinite(lower).all((-2, -1))
-    eye = jnp.broadcast_to(jnp.eye(matrices.shape[-1], dtype=matrices.dtype), matrices.shape)
-    lower = jnp.where(sound[..., None, None], lower, eye)
-    return jnp.swapaxes(jax.scipy.linalg.solve_triangular(lower, eye, lower=True), -1, -2), sound
+    half = jnp.swapaxes(linalg.inverse_root(matrices), -1, -2)
+    sound = jnp.isfinite(half).all((-2, -1))
+    return jnp.where(sound[..., None, None], half, jnp.eye(half.shape[-1], dtype=half.dtype)), sound
 
 
 @_inverse_root.defjvp

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.actuation import Actuation
@@ -192,7 +193,7 @@ def admitted(arguments: Arguments, raw: dict[str, jax.Array]) -> Grasps:
     if weights is not None:
         valid &= inverse_root(weights, n)[1]
         sane = jnp.where(valid, weights, jnp.eye(3, dtype=dtype)[..., None])
-        weight_roots = jnp.moveaxis(jnp.linalg.cholesky(jnp.moveaxis(sane, (1, 2), (-1, -2))), (-1, -2), (0, 1))
+        weight_roots = jnp.moveaxis(linalg.cholesky(jnp.moveaxis(sane, (1, 2), (-1, -2))), (-1, -2), (0, 1))
     valid &= jnp.isfinite(raw["wrench"]).all(0) & (raw["reserve"] >= 0) & jnp.isfinite(raw["reserve"])
     for extent in extents:
         valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, broadcast_batch
 from jaxgrasp.compiling import compiled
 from jaxgrasp.lanes.independent import automatically, one_lane
@@ -110,7 +111,7 @@ def _solve_one(program: Program) -> QPSolution:
     # Rounding in the caller's P may leave it that far from positive semidefinite.
     slack = 16 * P.shape[0] * jnp.finfo(P.dtype).eps * jnp.where(jnp.any(P != 0), largest(P), 1)
     shifted = jnp.where(finite, P / slack, 0) + jnp.eye(P.shape[0], dtype=P.dtype)
-    valid = finite & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
+    valid = finite & jnp.all(jnp.isfinite(linalg.cholesky(shifted)))
     program = Program(*(jnp.where(valid, v, 0) for v in program._replace(P=P)))
     scaled, back = _equilibrated(program)
     settings = Settings(
