@@ -13,6 +13,7 @@ FLOORS = {
     "process": -2,
     "compiling": -1,
     "arrays": 0,
+    "linalg": 0,
     "storage": 0,
     "records": 0,
     "kernels": 1,

@@ -6,6 +6,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, broadcast_batch
 from jaxgrasp.compiling import own_settings
 from jaxgrasp.records import record
@@ -75,7 +76,7 @@ class Actuation:
             inverse = jnp.asarray((right[:rank].T / values[:rank]) @ left[:, :rank].T, dtype)
             unreached = jnp.asarray(left[:, rank:].T, dtype) if rank < joints else None
         else:
-            inverse = jnp.linalg.pinv(given, rtol=_RANK_TOLERANCE)
+            inverse = linalg.pinv(given, _RANK_TOLERANCE)
             unreached = jnp.eye(joints, dtype=given.dtype) - given @ inverse
         return cls(
             jacobian=jacobian,

@@ -6,6 +6,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.contact.row_space import Basis, dot, row_basis
 from jaxgrasp.lanes.fence import each, fenced
@@ -63,11 +64,9 @@ def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array
 @jax.custom_jvp
 def _inverse_root(matrices: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute M with M M' = Q^-1 for Q (..., k, k), the identity where Q is not positive definite, and where it is."""
-    lower = jnp.linalg.cholesky(matrices, symmetrize_input=True)
-    usable = jnp.isfinite(lower).all((-2, -1))
-    eye = jnp.broadcast_to(jnp.eye(matrices.shape[-1], dtype=matrices.dtype), matrices.shape)
-    lower = jnp.where(usable[..., None, None], lower, eye)
-    return jnp.swapaxes(jax.scipy.linalg.solve_triangular(lower, eye, lower=True), -1, -2), usable
+    root = jnp.swapaxes(linalg.inverse_root(matrices), -1, -2)
+    usable = jnp.isfinite(root).all((-2, -1))
+    return jnp.where(usable[..., None, None], root, jnp.eye(root.shape[-1], dtype=root.dtype)), usable
 
 
 @_inverse_root.defjvp

@@ -108,7 +108,8 @@ class DisturbanceSet:
         """
         turn = as_float("rotation", rotation, (3, 3))
         apart = jnp.abs(jnp.swapaxes(turn, -1, -2) @ turn - jnp.eye(3, dtype=turn.dtype)).max((-2, -1))
-        sound = (apart <= (1e-6 if turn.dtype == jnp.float64 else 1e-4)) & (jnp.linalg.det(turn) > 0)
+        handed = jnp.sum(jnp.cross(turn[..., 0], turn[..., 1]) * turn[..., 2], -1)
+        sound = (apart <= (1e-6 if turn.dtype == jnp.float64 else 1e-4)) & (handed > 0)
         turn = jnp.where(sound[..., None, None], turn, jnp.nan)
         return DisturbanceSet(terms=tuple(term.rotated(turn) for term in self.terms))
 

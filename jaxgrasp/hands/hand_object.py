@@ -14,6 +14,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, frames_from_normals
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts
@@ -266,7 +267,7 @@ class HandObject:
             raise ValueError(f"compliance: actuators {', '.join(soft)} have no stiffness; wanted position servos")
         stiffness = as_float("tip_stiffness", tip_stiffness, ())
         jacobian = grasps.actuation.jacobian
-        flexible = jnp.linalg.pinv(grasps.joint_stiffness, rtol=1e-9)
+        flexible = linalg.pinv(grasps.joint_stiffness, 1e-9)
         tall = jacobian.reshape(*jacobian.shape[:-3], 3 * jacobian.shape[-3], jacobian.shape[-1])
         tips = jnp.broadcast_to(1 / stiffness, jacobian.shape[:-2]) if stiffness.ndim == 0 else 1 / stiffness
         tips = jnp.broadcast_to(jnp.repeat(tips, 3, -1), tall.shape[:-1])

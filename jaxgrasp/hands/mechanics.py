@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxgrasp import linalg
 from jaxgrasp.contact import Actuation
 from jaxgrasp.hands.actuators import Actuators
 from jaxgrasp.hands.couplings import Couplings
@@ -289,7 +290,7 @@ def _inverse(columns: Array, xp: ModuleType) -> Array:
     if columns.ndim == 2:
         return np.linalg.pinv(columns, tolerance)
     if xp is jnp:
-        return jnp.linalg.pinv(columns, rtol=tolerance)
+        return linalg.pinv(columns, tolerance)
     # Few differ where it is only stops that make them.
     different, which = np.unique(columns.reshape(len(columns), -1), axis=0, return_inverse=True)
     return np.linalg.pinv(different.reshape(-1, *columns.shape[1:]), tolerance)[which.reshape(-1)]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
@@ -61,7 +62,7 @@ def min_weight(contacts: Contacts, space: WrenchSpace | None = None) -> Float[Ar
         ValueError: options or shapes that do not fit.
     """
     edges = edges_of(contacts, space)
-    return _above_rounding(edges, _weight(edges, _dual(edges)), _spans(edges, _decomposed(edges)[1]))
+    return _above_rounding(edges, _weight(edges, _dual(edges)), _spans(_decomposed(edges)[0]))
 
 
 @metric
@@ -89,8 +90,8 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     dual = _dual(edges)
     least = _weight(edges, dual)
     dtype = edges.wrenches.dtype
-    left, singular = _decomposed(edges)
-    spans = _spans(edges, singular)
+    singular, directions = _decomposed(edges)
+    spans = _spans(singular)
     positive = least * _count(edges) > _LEAST_WEIGHT[dtype.name]
     # Edges that do not span the space close nothing, whether or not the program could be solved.
     known = edges.valid & ((dual.status != Status.MAX_ITERATIONS) | ~spans)
@@ -100,8 +101,7 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     weights = safe_divide(weights, weights.sum(-1, keepdims=True)).reshape(edges.wrenches.shape[:-1])
     forces = jnp.einsum("...ce,...cea->...ca", weights, edges.forces)
     # A twist along which every edge does negative work; where they do not span the space, one along which they do none.
-    flat_twist = left[..., -1] if left.shape[-1] == 6 else _orthogonal(left)
-    twist = jnp.where(~spans[..., None], flat_twist, dual.x[..., :6])
+    twist = jnp.where(~spans[..., None], directions[..., -1], dual.x[..., :6])
     twist = safe_divide(twist, jnp.max(jnp.abs(twist), -1, keepdims=True))
     turned = jnp.concatenate([twist[..., :3], twist[..., 3:] / edges.length[..., None]], -1)
     status = jnp.where(known, int(Status.SOLVED), int(Status.MAX_ITERATIONS))
@@ -134,16 +134,13 @@ def _weight(edges: Edges, dual: QPSolution) -> jax.Array:
 
 
 def _decomposed(edges: Edges) -> tuple[jax.Array, jax.Array]:
-    """Left singular vectors and singular values of the wrenches."""
+    """The six singular values of the wrenches, and the directions of wrenches that belong to them."""
     # Derivatives do not go through them: whether edges span the space does not change by little.
-    W = jax.lax.stop_gradient(edges.flat)
-    return jnp.linalg.svd(jnp.swapaxes(W, -1, -2), full_matrices=False, compute_uv=True)[:2]
+    return linalg.right_singular(edges.flat)
 
 
-def _spans(edges: Edges, singular: jax.Array) -> jax.Array:
+def _spans(singular: jax.Array) -> jax.Array:
     """Whether the wrenches span the space."""
-    if singular.shape[-1] < 6:
-        return jnp.zeros(edges.valid.shape, bool)
     return singular[..., 5] > RANK_TOLERANCE[singular.dtype.name] * singular[..., 0]
 
 
@@ -157,10 +154,3 @@ def _above_rounding(edges: Edges, least: jax.Array, spans: jax.Array) -> jax.Arr
 def _count(edges: Edges) -> jax.Array:
     """How many edges there are, at least 1."""
     return jnp.maximum(edges.counted.sum(-1, dtype=edges.wrenches.dtype), 1)
-
-
-def _orthogonal(left: jax.Array) -> jax.Array:
-    """A vector orthogonal to fewer than six columns (*batch, 6, k)."""
-    residual = jnp.eye(6, dtype=left.dtype) - left @ jnp.swapaxes(left, -1, -2)
-    longest = jnp.argmax(jnp.sum(residual**2, -2), -1)
-    return jnp.take_along_axis(residual, longest[..., None, None], -1)[..., 0]

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxgrasp import linalg
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
 
 SMALLEST_BALL = {"float64": 1e-7, "float32": 1e-3}
@@ -32,7 +33,7 @@ def contains_origin(wrenches: jax.Array) -> jax.Array:
     W, dtype = lax.stop_gradient(wrenches), wrenches.dtype
     if len(W) < 7:
         return jnp.zeros((), bool)
-    singular = jnp.linalg.svd(W, compute_uv=False)
+    singular = linalg.right_singular(W)[0]
     spans = singular[5] > RANK_TOLERANCE[dtype.name] * singular[0]
     farthest = 1 / SMALLEST_BALL[dtype.name]
 
@@ -44,7 +45,7 @@ def contains_origin(wrenches: jax.Array) -> jax.Array:
         u, _, steps = state
         scaled = W / (1 - W @ u)[:, None]
         gradient = jnp.sum(scaled, 0)
-        move = -jnp.linalg.solve(scaled.T @ scaled, gradient[:, None])[:, 0]
+        move = -linalg.solve_positive(scaled.T @ scaled, gradient[:, None])[:, 0]
         decrement = jnp.sqrt(jnp.maximum(-(gradient @ move), 0))
         new = u + move / (1 + decrement)
         # Rounding ends the walk where the wrenches hardly span the space: that is no closure.

@@ -17,7 +17,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import safe_divide
+from jaxgrasp import linalg
+from jaxgrasp.arrays import literal, safe_divide
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.lanes.independent import one_lane
@@ -101,8 +102,8 @@ def _farthest(W: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     groups, dtype = W.shape[0], W.dtype
     random = np.random.default_rng(0).normal(size=(_RANDOM_STARTS, 6))
-    principal = jnp.linalg.eigh(jnp.einsum("gki,gkj->ij", W, W))[1].T
-    starts = jnp.concatenate([principal, -principal, jnp.asarray(random, dtype)])
+    principal = linalg.right_singular(W.reshape(-1, 6))[1].T
+    starts = jnp.concatenate([principal, -principal, literal(random, dtype)])
     middle = jnp.full(groups, 1 / (groups + 1), dtype)
 
     def walk(n: jax.Array, t: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
@@ -129,7 +130,7 @@ def _step(W: jax.Array, n: jax.Array, t: jax.Array, direction: jax.Array) -> tup
     own = jnp.einsum("gki,gkj->ij", scaled, scaled) + jnp.diag(1 / (reach - n) ** 2 + 1 / (reach + n) ** 2)
     others = jnp.diag(jnp.sum(d * d, -1) + 1 / t**2) + 1 / rest**2
     right = jnp.concatenate([direction, jnp.zeros_like(t)])
-    move = jnp.linalg.solve(jnp.block([[own, across.T], [across, others]]), right[:, None])[:, 0]
+    move = linalg.solve_positive(jnp.block([[own, across.T], [across, others]]), right[:, None])[:, 0]
     dn, dt = move[:6], move[6:]
     fall = W @ dn - dt[:, None]
     used = jnp.concatenate([(fall * d).ravel(), -dt / t, jnp.sum(dt)[None] / rest, dn / (reach - n), -dn / (reach + n)])

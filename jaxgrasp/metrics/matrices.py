@@ -2,9 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import safe_divide, safe_norm
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
@@ -84,8 +84,7 @@ def _extreme(blocks: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The sixth and the first singular value of G from blocks (*batch, n_c, 6, 3)."""
     G = jnp.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], 6, 3 * blocks.shape[-3])
     # The derivative of a singular value is that of |G'u| with its own u held.
-    held = lax.stop_gradient(G)
-    u = jnp.linalg.eigh(held @ jnp.swapaxes(held, -1, -2))[1]
+    u = linalg.right_singular(jnp.swapaxes(G, -1, -2))[1]
     length = lambda column: safe_norm(jnp.einsum("...ij,...i->...j", G, column))
-    smallest, largest = length(u[..., 0]), length(u[..., -1])
+    smallest, largest = length(u[..., -1]), length(u[..., 0])
     return jnp.where(smallest > RANK_TOLERANCE[G.dtype.name] * largest, smallest, 0), largest

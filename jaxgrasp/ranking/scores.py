@@ -59,8 +59,7 @@ def score(
     report = progress or (lambda _: None)
     columns, values = columns_of(candidates), np.empty(len(candidates))
     if METRICS[name].batched:
-        own = name == "margin"
-        settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None if own else _TILE, "spread": own}
+        settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None if name == "margin" else _TILE}
         for rows, value in solve_in_tiles(_scorer(name, cone_edges), columns, disturbances, **settings):
             values[rows] = value + 0.0  # minus zero is zero
             report(rows.stop)

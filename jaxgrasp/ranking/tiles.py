@@ -67,7 +67,6 @@ def solve_in_tiles(
     gravity: float,
     cone_edges: int,
     tile: int | None,
-    spread: bool = True,
 ) -> Iterator[tuple[slice, Any]]:
     """Runs a solver over all candidates, one tile after the other with one compilation.
 
@@ -78,14 +77,11 @@ def solve_in_tiles(
         gravity: Along the object's -z, m/s^2; zero means that no weight but that of `required_wrench` need be borne.
         cone_edges: Edges of the friction pyramid.
         tile: Candidates at a time, at most; None chooses by platform.
-        spread: Whether over all devices of this process. On several CPU devices at once, batches of LAPACK's routines
-            were seen to wait for each other for ever.
 
     Yields:
         The rows of each tile and the solver's answer for them, in NumPy.
     """
-    devices = jax.local_devices()
-    mesh = Mesh(np.array(devices if spread else devices[:1]), ("candidates",))
+    mesh = Mesh(np.array(jax.local_devices()), ("candidates",))
     count = len(columns["positions"])
     tile = tile or TILE.get(jax.default_backend(), ACCELERATOR_TILE)
     # Tiles of equal size waste less than a last one that is mostly padding.

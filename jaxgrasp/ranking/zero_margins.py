@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxgrasp import linalg
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
@@ -85,8 +86,7 @@ def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) 
     """The place of each grasp's reason in `_REASONS`."""
     edges = edges_of(contacts, WrenchSpace(cone_edges=cone_edges))
     G = jnp.moveaxis(edges.grasp_map, -3, -2).reshape(*edges.valid.shape, 6, -1)
-    left, found, _ = jnp.linalg.svd(G)
-    singular = jnp.zeros((len(G), 6), G.dtype).at[:, : found.shape[-1]].set(found)
+    singular, left = linalg.right_singular(jnp.swapaxes(G, -1, -2))
     # Rows: directions of wrenches, and which of them no contact forces exert.
     directions = jnp.swapaxes(left, -1, -2)
     unreached = singular <= RANK_TOLERANCE[G.dtype.name] * singular[:, :1]

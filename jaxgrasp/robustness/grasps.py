@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.actuation import Actuation
@@ -204,7 +205,7 @@ def _roots_of_weights(
         return None, None, jnp.array(True)
     usable = inverse_root(masked, active.shape[0])[1]
     definite = jnp.where(valid & usable, masked, jnp.eye(3, dtype=masked.dtype)[..., None])
-    roots = jnp.linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
+    roots = linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
     return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
 
 

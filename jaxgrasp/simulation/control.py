@@ -16,9 +16,9 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgrasp import linalg
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.simulation.state import State
 from jaxgrasp.solvers import solve_qp
@@ -121,23 +121,18 @@ def _follow(state: State) -> Float[Array, "lanes joints 6"]:
     """J^+ G': joint velocities with which the fingertips go along with a twist of the object."""
     across = jnp.swapaxes(state.jacobian, -1, -2)
     product = state.jacobian @ across + _DAMPING * jnp.eye(across.shape[-1])
-    return across @ _solve(product, jnp.swapaxes(state.grasp_map, -1, -2))
+    return across @ linalg.solve_positive(product, jnp.swapaxes(state.grasp_map, -1, -2))
 
 
 def _blocking(state: State, wrench: Array, compliance: Array | None) -> Float[Array, "lanes vars"]:
     """G* w of (15)."""
-    rows = _SCALE[:, None] * state.grasp_map
+    rows = state.grasp_map * _SCALE[:, None]
     across = jnp.swapaxes(rows, -1, -2)
-    softened = across if compliance is None else _solve(compliance, across)
+    softened = across if compliance is None else linalg.solve_positive(compliance, across)
     gram = rows @ softened
     least = _RANK * jnp.trace(gram, axis1=-2, axis2=-1) + _FLOOR
     gram = gram + least[:, None, None] * jnp.eye(6)
-    return (softened @ _solve(gram, (_SCALE * wrench)[..., None]))[..., 0]
-
-
-def _solve(matrix: ArrayLike, right: ArrayLike) -> Array:
-    """For positive definite matrices."""
-    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix, symmetrize_input=False), True), right)
+    return (softened @ linalg.solve_positive(gram, (wrench * _SCALE)[..., None]))[..., 0]
 
 
 def _torques(state: State, goal: Goal, forces: Array) -> Float[Array, "lanes joints"]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
@@ -184,9 +185,8 @@ def _weighted(
         compliance = blocks.reshape(blocks.shape[0], 3 * n, 3 * n)
     eye = jnp.eye(3 * n, dtype=rows.dtype)
     sane = jnp.where(there[:, :, None] & there[:, None, :], compliance, eye)
-    lower = jnp.linalg.cholesky(sane, symmetrize_input=True)
     # M = L^-T for Q = L L'.
-    half = jnp.swapaxes(jax.scipy.linalg.solve_triangular(lower, jnp.broadcast_to(eye, sane.shape), lower=True), 1, 2)
+    half = jnp.swapaxes(linalg.inverse_root(sane), 1, 2)
     inverse = echelon(jnp.einsum("rkl,lkm->rml", rows, half), rank).inverse
     return jnp.einsum("lkm,mrl->krl", half, inverse)
 

@@ -8,6 +8,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, fold
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
@@ -248,7 +249,8 @@ def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) 
     change = None
     if grasps.inverse_root is not None:
         inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.inverse_root, grasps.inverse_root)
-        change = jnp.moveaxis(jnp.linalg.inv(inverse), (0, -2, -1), (2, 0, 1))
+        compliance = linalg.solve_positive(inverse, jnp.broadcast_to(jnp.eye(3, dtype=dtype), inverse.shape))
+        change = jnp.moveaxis(compliance, (0, -2, -1), (2, 0, 1))
     change = scaled(change)
     largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (rest, change)])
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))

@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxgrasp import linalg
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.status import Status
 
@@ -145,7 +146,7 @@ class HomogeneousEmbedding:
     def root(self) -> jax.Array:
         """A triangular square root of P, regularised, (n, n)."""
         P, small = self.program.P, self.constants.regularisation
-        return jnp.linalg.cholesky(P + small * jnp.eye(P.shape[0], dtype=P.dtype)).T
+        return linalg.cholesky(P + small * jnp.eye(P.shape[0], dtype=P.dtype)).T
 
     def newton(self, factors: Factors, right: tuple) -> tuple:
         """Solve P x + A'y + G'z = r1, A x = r2, G x - z/w = r3; refinement also takes back the regularisation."""
@@ -238,28 +239,9 @@ def _inverse_factor(rows: jax.Array) -> jax.Array:
         columns = rows @ inverse
         gram = columns.T @ columns
         shift = n * jnp.finfo(rows.dtype).eps * jnp.max(jnp.diag(gram))
-        lower = jnp.linalg.cholesky(gram + shift * identity)
-        return inverse @ _triangular_inverse(lower).T
+        return inverse @ linalg.inverse_root(gram + shift * identity).T
 
     return lax.fori_loop(0, 3, refine, identity)
-
-
-def _triangular_inverse(lower: jax.Array) -> jax.Array:
-    """Invert a lower triangular matrix by inverting its diagonal blocks, whose size doubles at each turn.
-
-    This takes products alone: the threads of BLAS's triangular solver cost ten times its work for many small matrices.
-    """
-    n, size = lower.shape[0], 1
-    padded = 1 << (n - 1).bit_length()
-    lower = jnp.pad(lower, (0, padded - n)) + jnp.diag((jnp.arange(padded) >= n).astype(lower.dtype))
-    blocks = 1 / jnp.diag(lower)[:, None, None]
-    while size < padded:
-        first, second = blocks[0::2], blocks[1::2]
-        pairs = jnp.arange(padded // (2 * size))
-        below = lower.reshape(len(pairs), 2, size, len(pairs), 2, size)[pairs, 1, :, pairs, 0, :]
-        blocks = jnp.block([[first, jnp.zeros_like(first)], [-second @ below @ first, second]])
-        size *= 2
-    return blocks[0, :n, :n]
 
 
 def largest(v: jax.Array) -> jax.Array:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, broadcast_batch
 from jaxgrasp.compiling import compiled
 from jaxgrasp.lanes.independent import one_lane, with_automatic_axes
@@ -114,7 +115,7 @@ def _solve_one(program: QuadraticProgram) -> QPSolution:
     # Rounding in the caller's P may leave it that far from positive semidefinite.
     slack = 16 * P.shape[0] * jnp.finfo(P.dtype).eps * jnp.where(jnp.any(P != 0), largest(P), 1)
     shifted = jnp.where(finite, P / slack, 0) + jnp.eye(P.shape[0], dtype=P.dtype)
-    valid = finite & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
+    valid = finite & jnp.all(jnp.isfinite(linalg.cholesky(shifted)))
     program = QuadraticProgram(*(jnp.where(valid, v, 0) for v in program._replace(P=P)))
 
     # Run the loop on the equilibrated program, as constants to the derivative.
