@@ -126,13 +126,14 @@ def _follow(state: State) -> Float[Array, "lanes joints 6"]:
 
 def _blocking(state: State, wrench: Array, compliance: Array | None) -> Float[Array, "lanes vars"]:
     """G* w of (15)."""
-    rows = _SCALE[:, None] * state.grasp_map
+    rows = jnp.asarray(_SCALE[:, None] * state.grasp_map)
     across = jnp.swapaxes(rows, -1, -2)
     softened = across if compliance is None else linalg.solve_positive(compliance, across)
     gram = rows @ softened
     least = _RANK * jnp.trace(gram, axis1=-2, axis2=-1) + _FLOOR
     gram = gram + least[:, None, None] * jnp.eye(6)
-    return (softened @ linalg.solve_positive(gram, (_SCALE * wrench)[..., None]))[..., 0]
+    right = jnp.asarray(_SCALE * wrench)[..., None]
+    return (softened @ linalg.solve_positive(gram, right))[..., 0]
 
 
 def _torques(state: State, goal: Goal, forces: Array) -> Float[Array, "lanes joints"]:
