@@ -267,11 +267,10 @@ class HandObject:
             raise ValueError(f"compliance: actuators {', '.join(soft)} have no stiffness; wanted position servos")
         stiffness = as_float("tip_stiffness", tip_stiffness, ())
         jacobian = grasps.actuation.jacobian
-        flexible = linalg.pinv(grasps.joint_stiffness, 1e-9)
         tall = jacobian.reshape(*jacobian.shape[:-3], 3 * jacobian.shape[-3], jacobian.shape[-1])
         tips = jnp.broadcast_to(1 / stiffness, jacobian.shape[:-2]) if stiffness.ndim == 0 else 1 / stiffness
         tips = jnp.broadcast_to(jnp.repeat(tips, 3, -1), tall.shape[:-1])
-        reached = tall @ flexible @ jnp.swapaxes(tall, -1, -2)
+        reached = tall @ linalg.pinv(grasps.joint_stiffness, 1e-9) @ jnp.swapaxes(tall, -1, -2)
         return reached + tips[..., None] * jnp.eye(tall.shape[-2], dtype=tall.dtype)
 
     @property
