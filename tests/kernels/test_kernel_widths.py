@@ -30,6 +30,9 @@ LOOSE = ("forces", "effort", "actuator", "blocking", "changes")
 NOISE = ("residual", "gap", "iterations", "multipliers")
 """What rounding decides, or a gap of rounding: kernels agree with each other on it."""
 
+NOT_BINDING = {"of total efforts: [2]": 1.0}
+"""N: the bounds on forces bind in none of these efforts, so that their derivatives are what multipliers leave of zero."""
+
 TOLERANCE_CHAIN = {"float64": 2e-8, "float32": ACCEPTED["float32"]}
 """The same of formulations."""
 
@@ -103,7 +106,7 @@ def hold_against_xla(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray],
         if loose and group == "margins" and dtype == "float32":
             # Of the forces of many contacts many are best; that these are is what bounds and the audit say.
             continue
-        unit = mean_force(program) if path in (".margin", ".upper_bound", ".directions") else 0.0
+        unit = mean_force(program) if path in (".margin", ".upper_bound", ".directions") else NOT_BINDING.get(name, 0.0)
         lanes = far(ours[name], reference, (POINTS if loose else tolerance)[dtype], unit)
         lanes = np.setdiff1d(lanes, undecided.get(f"{program}: .status", []))
         if dtype == "float32":
