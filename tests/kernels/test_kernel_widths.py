@@ -31,7 +31,7 @@ NOISE = ("residual", "gap", "iterations", "multipliers")
 """What rounding decides, or a gap of rounding: kernels agree with each other on it."""
 
 NOT_BINDING = {"of total efforts: [2]": 1.0}
-"""N: the bounds on forces bind in none of these efforts, so that their derivatives are what multipliers leave of zero."""
+"""N: the bounds on forces bind in none of these efforts, and what multipliers leave of zero is their derivative."""
 
 TOLERANCE_CHAIN = {"float64": 2e-8, "float32": ACCEPTED["float32"]}
 """The same of formulations."""
