@@ -31,11 +31,11 @@ WEIGHTS = (0.05, 0.06, 0.07, 0.08, 0.1, 0.15, 0.2, 0.5, 1.0, 10.0)
 SHARES = (0.75, 0.76, 0.77, 0.78, 0.79, 0.8, 0.85, 0.9)
 QUICK = (0.1, 1.0)
 PUSH = 0.75
-"""Of lambda."""
+"""The force of a push, as a share of lambda."""
 FRICTION, MAX_FORCE = 0.8, 2.0
 BASELINE = np.tile([0.0, 0.0, -0.5], (4, 1))
 AT_REST, CARRIED = 0.4, 4.0
-"""s."""
+"""Seconds that are simulated."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Case:
     w: float | None = None
     """None is computed torque."""
     force: float = 0.0
-    """Of the push, N; only for `in_motion`."""
+    """The force of the push, N; only for `in_motion`."""
     replan: tuple[float, float] | None = None
-    """See `Simulator.run`."""
+    """The distance off the path, m, and the time, s, after which it begins anew, as in `Simulator.run`."""
 
 
 def plan(sim: Simulator, share: float, required_wrench: jax.Array | None = None) -> tuple[float, np.ndarray]:

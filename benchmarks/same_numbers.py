@@ -1,6 +1,6 @@
 """The same numbers as before: margins, efforts, formulations and gradients of 5,000 grasps, held against stored ones.
 
-    python -m benchmarks.same_numbers [--write]
+    JAXGRASP_AUDIT=off python -m benchmarks.same_numbers [--write]
 
 For a change that should change no number. `same_numbers.json` has a digest of every result and a sample of its
 entries; where a digest differs, the largest relative difference in the sample is printed. With --write the file is
@@ -29,7 +29,7 @@ FORMULATIONS = ("12", "12_fixed", "13", "16", "per_direction", "per_direction_pr
 
 
 def grasps(dtype: str) -> jg.Contacts:
-    """Of four contacts on unit spheres of 5 cm, some of them absent, with friction and bounds that differ."""
+    """Make random grasps of four contacts on a ball of 5 cm; some contacts are absent, friction and bounds differ."""
     rng = np.random.default_rng(23)
     normals = rng.normal(size=(GRASPS, 4, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)

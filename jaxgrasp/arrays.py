@@ -168,7 +168,7 @@ def _turn_near_minus_z_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tupl
 
 
 def _rise(z: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How far z is below -`_LOW`, from 0 with two derivatives to 2 at -1, and the derivative."""
+    """Compute a function of z that is 0 above -`_LOW` and 2 at -1, twice differentiable, and its derivative."""
     share = jnp.clip((-z - _LOW) / (1 - _LOW), 0, 1)
     slope = jnp.where(share > 0, -3 * share**2 * (1 - z) / (1 - _LOW) - share**3, 0)
     return share**3 * (1 - z), slope

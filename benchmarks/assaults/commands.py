@@ -47,7 +47,7 @@ def write_hand_grasps(folder: Path, count: int) -> None:
 
 
 def made(folder: Path) -> list[Path]:
-    """What commands have written, folders and files in them."""
+    """List the folders and files that commands have written."""
     return [path for path in folder.rglob("*") if path.name not in (GRASPS, OF_HAND)]
 
 

@@ -26,7 +26,7 @@ class Outcome:
     """Negative for a signal."""
     errors: str
     seconds: float
-    """Of the processor, its children included."""
+    """Processor time, that of its children included, s."""
     mebibytes: float
     accepted_wrongly: str = ""
 

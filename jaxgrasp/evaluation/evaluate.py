@@ -218,7 +218,7 @@ class _Prepared(Generic[T]):
 
     grasps: GraspSet
     rows: list[int]
-    """Which of all grasps they are."""
+    """The rows of these grasps among all grasps."""
     stages: dict[str, np.ndarray]
     trial: T | None
     """None where hand and object are not usable."""

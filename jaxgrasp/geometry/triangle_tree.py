@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 LEAF, BLOCK = 16, 8
 """Triangles of a leaf, and points of a block."""
 ROUNDING = np.float32(1e-6)
-"""Of single precision, in lengths of the whole."""
+"""Rounding of single precision, as a share of the mesh's extent."""
 # Radii of a part between it and a block to which it is a dipole: the sum is then off by about 1e-3.
 _FAR = 2.0
 # Pairs of a block and a part at a time, about a hundred bytes each.
@@ -35,7 +35,7 @@ class Blocks(NamedTuple):
 
     points: Float[np.ndarray, "blocks block 3"]
     order: Int[np.ndarray, " points"]
-    """Which point each is."""
+    """The index of each point among those that were given."""
     lower: Float[np.ndarray, "blocks 3"]
     upper: Float[np.ndarray, "blocks 3"]
     centre: Float[np.ndarray, "blocks 3"]

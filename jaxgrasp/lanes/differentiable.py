@@ -26,17 +26,17 @@ Tree = Any
 
 @dataclass(frozen=True)
 class Lanes:
-    """How the arguments of a batched function lie: leaves (lanes, ...), or without the leading axis where shared."""
+    """Layout of a batched function's arguments: leaves (lanes, ...), or without the leading axis where shared."""
 
     admit: Callable[[Tree], Any]
     """Turns the arguments, lanes last, into what the stages take: a function of a module, so that its name tells which
     one it is."""
     shared: Tree
-    """Whether all lanes share a leaf, a bool for each, parallel to the arguments."""
+    """A tree parallel to the arguments with a bool for each leaf: all lanes share it."""
     rows: int
     """The number of rows of a lane, which sets the size of a tile."""
     compact: bool
-    """Whether a tile can be one function, see `map_lanes`."""
+    """True if a tile can be one function, see `map_lanes`."""
     tile: int
     """The number of lanes of a tile that cannot be one function."""
 

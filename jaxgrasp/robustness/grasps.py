@@ -101,7 +101,7 @@ def over_grasps(function: BatchedFunction, data: GraspData, options: Options | N
 def _run(function: BatchedFunction, data: GraspData, options: Options) -> Any:
     """Run the function over the lanes."""
     arguments = lay_out(data, options)
-    # Library calls, as for the roots of Q, cannot be part of a compact tile.
+    # Roots of Q take loops over columns, which compact tiles do without.
     compact = function.tile is None and data.compliance is None and options.effort_weights is None
     n = data.contacts.n_c
     rows = n * (function.rows + 1)
