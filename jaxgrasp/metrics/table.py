@@ -91,7 +91,12 @@ METRICS = {
     for metric in (
         Metric(name="margin", about="robustness margin (21)", value=_margin),
         Metric(name="margin_12", about="largest disturbance by (12)", value=_margin_of("12"), formulation="12"),
-        Metric(name="margin_12_fixed", about="by (12) with blocking forces", value=_margin_of("12_fixed"), formulation="12_fixed"),
+        Metric(
+            name="margin_12_fixed",
+            about="by (12) with blocking forces",
+            value=_margin_of("12_fixed"),
+            formulation="12_fixed",
+        ),
         Metric(name="margin_13", about="by (13)", value=_margin_of("13"), formulation="13"),
         Metric(name="margin_16", about="by (16)", value=_margin_of("16"), formulation="16"),
         Metric(

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxgrasp.contact.friction import pyramid_facets
-from jaxgrasp.robustness.chain.refinement import Bounds, Programs, Solve, finish, first_direction
+from jaxgrasp.robustness.chain.refinement import Bounds, OnHost, Programs, Solve, finish, first_direction
 from jaxgrasp.robustness.chain.verdicts import FormulationSolution
 from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.solvers.status import Status
@@ -61,7 +61,7 @@ class _Rows:
             The least t (L,) such that (1 - t) f + t g keeps all rows at (1 - t) margin, 1 where none does, and the
             member behind the worst row of each contact (L, n, 6).
         """
-        with np.errstate(invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             over = self._over(forces) + margin[:, None, None] * self.reach
             room = -self._over(deep)
             asked = np.where(over > self.kept, over / (over + np.maximum(room, 0)), 0)
@@ -103,7 +103,7 @@ def refine_shared(
 
 def _refine_some(
     programs: Programs, bounds: Bounds, lanes: np.ndarray, first: np.ndarray, blocks: np.ndarray, tolerance: float
-) -> FormulationSolution:
+) -> OnHost:
     """Find the bounds of some lanes, and the best solution of each for the member of its set that binds."""
     members = np.zeros((len(lanes), programs.directions, 6))
     deep = programs.of(lanes, members).forces
@@ -159,12 +159,10 @@ def _rows_of(programs: Programs, lanes: np.ndarray, blocks: np.ndarray) -> _Rows
     )
 
 
-def _mix(
-    found: FormulationSolution, deep: np.ndarray, members: np.ndarray, blocks: np.ndarray, share: np.ndarray
-) -> FormulationSolution:
+def _mix(found: OnHost, deep: np.ndarray, members: np.ndarray, blocks: np.ndarray, share: np.ndarray) -> OnHost:
     """Solutions with a share of the deep forces, at as much less of a margin, for the member that binds."""
     rest = found.forces + share[:, None, None] * (deep - found.forces)
-    margin = (1 - share) * found.margin
+    margin = np.where(np.isfinite(found.margin), (1 - share) * found.margin, 0)
     at = np.maximum(found.direction, 0)[:, None, None]
     worst = np.take_along_axis(members, at, 1)[:, 0]
     answered = rest - margin[:, None, None] * np.einsum("lnae,le->lna", blocks, worst)

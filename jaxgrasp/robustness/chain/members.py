@@ -1,4 +1,4 @@
-"""Members of a disturbance set that stand for all of it: corners of boxes, the worst for a row, axes that surround it."""
+"""Members of a disturbance set that stand for all of it: corners of a box, the worst for rows, axes that span it."""
 
 import itertools
 from functools import partial
@@ -31,12 +31,11 @@ def polytope_of(disturbances: DisturbanceSet) -> DisturbanceSet | None:
     Raises:
         ValueError: a smoothed set.
     """
-    terms = disturbances.terms
-    if any(term.width is not None for term in terms):
+    if any(term.width is not None for term in disturbances.terms):
         raise ValueError("disturbances: got a smoothed set, wanted one that is not, since the chain has no smooth form")
-    if len(terms) > 1 or not isinstance(terms[0], Vertices | Box):
+    term, *others = disturbances.terms
+    if others or not isinstance(term, Vertices | Box):
         return None
-    (term,) = terms
     if isinstance(term, Vertices):
         return disturbances
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=6)))
@@ -76,9 +75,7 @@ def worst_of_rows(
     facets = jnp.concatenate([tangents, normals[..., None]], -1)
     loads = -jnp.einsum("...nkc,...nce->...nke", facets, blocks, precision="highest")
     loads = loads.reshape(*loads.shape[:-3], -1, 6)
-    reached = jnp.einsum(
-        "...er,...rw->...ew", jax.lax.stop_gradient(grasp_map(contacts)), inverse, precision="highest"
-    )
+    reached = jnp.einsum("...er,...rw->...ew", jax.lax.stop_gradient(grasp_map(contacts)), inverse, precision="highest")
     outside = jnp.eye(6, dtype=inverse.dtype) - reached
     directions = jnp.concatenate([loads, outside, -outside], -2)
     batch = jnp.broadcast_shapes(directions.shape[:-2], disturbances.batch_shape)
@@ -89,7 +86,10 @@ def worst_of_rows(
     members = furthest(terms, jnp.moveaxis(to_last(directions), 1, 0))
     members = jnp.moveaxis(members, 0, 1)
     members = jnp.moveaxis(members, tuple(range(-lead, 0)), tuple(range(lead))) if lead else members
-    return DisturbanceSet(terms=(Vertices(wrenches=members),))
+    usable = jnp.array(True)
+    for term in disturbances.terms:
+        usable &= (term.extent() >= 0).all(-1)
+    return DisturbanceSet(terms=(Vertices(wrenches=jnp.where(usable[..., None, None], members, jnp.nan)),))
 
 
 class SetOfLanes(NamedTuple):

@@ -3,14 +3,16 @@
 Where every direction w has forces of its own, those that are withstood form a convex set V, {w: lambda = 1 can be had},
 and the margin is the largest lambda with lambda D in V. A program for one direction finds the point of V's boundary on
 it, and a bound beyond which no forces reach. Points span a polytope inside V (`expansion`): by its facets the margin is
-at least min 1 / h_D(l). The member of D that reaches furthest along the normal of the worst facet is the next direction:
-its own bound holds for all of D, and its point pushes the facet out. A dozen directions are enough for most grasps.
+at least min 1 / h_D(l). The member of D that reaches furthest along the normal of the worst facet is the next
+direction: its own bound holds for all of D, and its point pushes the facet out. After the axes of D, a dozen directions
+are enough for most grasps.
 
 For one f_0 and blocking forces see `cuts`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +24,12 @@ from jaxgrasp.lanes.direct import power_of_two
 from jaxgrasp.robustness.chain.expansion import Polytope
 from jaxgrasp.robustness.chain.members import SetOfLanes
 from jaxgrasp.robustness.chain.verdicts import FormulationSolution
-from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData
 from jaxgrasp.solvers.status import Status
 
 Solve = Callable[[GraspData], FormulationSolution]
+# A `FormulationSolution` of NumPy's arrays, lanes leading.
+OnHost = Any
 
 # Directions of a grasp at a time, and grasps.
 _AT_ONCE = 4
@@ -49,7 +53,7 @@ class Programs:
         self.sets = SetOfLanes(host.disturbances.terms, arguments.shared.data.disturbances.terms)
         self.precision = {"float64": 1e-9, "float32": 1e-5}[self.dtype.name]
 
-    def of(self, lanes: np.ndarray, wrenches: np.ndarray) -> FormulationSolution:
+    def of(self, lanes: np.ndarray, wrenches: np.ndarray) -> OnHost:
         """Solve for wrenches (L, D, 6) of some lanes (L,); leaves (L, ...) on the host."""
         parts = [
             self._call(lanes[at : at + self.size], wrenches[at : at + self.size])
@@ -57,7 +61,7 @@ class Programs:
         ]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
-    def _call(self, lanes: np.ndarray, wrenches: np.ndarray) -> FormulationSolution:
+    def _call(self, lanes: np.ndarray, wrenches: np.ndarray) -> OnHost:
         some = np.resize(lanes, self.size)
         given = np.zeros((self.size, self.directions, 6), self.dtype)
         given[: len(lanes)] = wrenches
@@ -84,7 +88,7 @@ class Bounds:
         count = len(worst)
         return cls(np.zeros(count), np.full(count, np.inf), np.zeros(count, int), np.zeros(count, bool), worst.copy())
 
-    def note(self, lanes: np.ndarray, found: FormulationSolution, wrenches: np.ndarray) -> None:
+    def note(self, lanes: np.ndarray, found: OnHost, wrenches: np.ndarray) -> None:
         """Take over what members of the sets of lanes (L,) prove, wrenches (L, D, 6), by their solutions."""
         solved = found.status == Status.SOLVED
         better = solved & (found.upper_bound < self.upper[lanes])
@@ -166,7 +170,7 @@ def refine(arguments: Arguments, solve: Solve, tolerance: float) -> FormulationS
 def _begin(programs: Programs) -> tuple[Bounds, dict[int, _Lane]]:
     """Solve for the axes of every lane's set, both ways; lanes that are not decided by them get a polytope."""
     count, lanes = programs.count, np.arange(programs.count)
-    every = [programs.sets.axes(lane) for lane in lanes]
+    every = [programs.sets.axes(lane) for lane in range(count)]
     ends, inverses = np.zeros((count, 12, 6)), []
     for lane, (axes, _) in enumerate(every):
         ends[lane, : 2 * axes.shape[1]] = np.concatenate([axes.T, -axes.T])
@@ -229,16 +233,14 @@ def _push(programs: Programs, bounds: Bounds, live: dict[int, _Lane], tolerance:
     return still
 
 
-def first_direction(found: FormulationSolution, worst: np.ndarray) -> FormulationSolution:
+def first_direction(found: OnHost, worst: np.ndarray) -> OnHost:
     """A solution for the first of its directions, the worst member of a set (lanes, 6)."""
     return replace(
         found, directions=found.directions[:, :1], disturbed_forces=found.disturbed_forces[:, :1], worst_wrench=worst
     )
 
 
-def finish(
-    arguments: Arguments, bounds: Bounds, found: FormulationSolution, tolerance: float
-) -> FormulationSolution:
+def finish(arguments: Arguments, bounds: Bounds, found: OnHost, tolerance: float) -> FormulationSolution:
     """A solution for one direction with the bounds and statuses of the whole set.
 
     Args:

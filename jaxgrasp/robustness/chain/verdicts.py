@@ -53,7 +53,7 @@ class FormulationSolution:
     primal_residual: Float[Array, "*batch"]
     """Largest violation of any row or equality, forces in units of f_max (mu f_max along the surface)."""
     gap: Float[Array, "*batch"]
-    """(upper_bound - margin) / max(scale, margin); (upper_bound - margin) / upper_bound where directions are refined."""
+    """(upper_bound - margin) / max(scale, margin), over upper_bound where directions are refined."""
     worst_wrench: Float[Array, "*batch 6"] | None = None
     """The member of the set that decides, N and N m, where directions are refined; else None."""
 
