@@ -162,13 +162,15 @@ def _balance(grasps: Grasps, basics: Basics, rest: jax.Array, forces: jax.Array,
     Directions without a lambda_j above 0 do not count.
     """
     counts = jnp.isfinite(reached) & (reached > 0)
-    required = grasps.wrench - jnp.moveaxis(jnp.where(counts, reached, 0) * basics.wrenches, 1, 0)
-    required = jnp.concatenate([required, grasps.wrench[None]])
+    taken = jnp.moveaxis(jnp.where(counts, reached, 0) * basics.wrenches, 1, 0)
+    required = jnp.concatenate([grasps.wrench - taken, grasps.wrench[None]])
     counts = jnp.concatenate([counts, jnp.ones_like(counts[:1])])
     supplying = jnp.concatenate([forces, rest[None]])
     supplied = jnp.einsum("eanl,danl->del", grasps.columns, supplying, precision="highest")
     sizes = jnp.sqrt((supplying * supplying).sum(1)).sum(1)
-    sizes = jnp.maximum(sizes, jnp.abs(required).max(1))
+    # A disturbance that takes all of the load off leaves nothing but the rounding of their difference.
+    taken = jnp.concatenate([jnp.abs(taken).max(1), jnp.abs(grasps.wrench).max(0)[None]])
+    sizes = jnp.maximum(jnp.maximum(sizes, jnp.abs(required).max(1)), taken)
     right = jnp.abs(supplied - required).max(1) <= _MISSED[forces.dtype.name] * sizes
     return (right | ~counts).all(0)
 
