@@ -149,29 +149,24 @@ def one_more(values: np.ndarray, batch: tuple[int, ...]) -> jg.Contacts:
 
 
 def test_the_number_of_axes_decides_what_a_margin_is_for() -> None:
-    """Four contacts, four edges and four grasps: lengths alone would fit everything."""
-    normals = np.array([[1.0, 0, 0.2], [-1, 0.1, 0], [0, 1, 0.1], [0.1, -1, -0.2]])
-    forces, d = jg.DisturbanceSet.forces(1.0), np.random.default_rng(1).uniform(0, 0.05, (4, 4))
+    """Three contacts, three edges and three grasps: lengths alone would fit everything."""
+    angles = 2 * np.pi / 3 * np.arange(3)
+    normals = np.stack([np.cos(angles), np.sin(angles), 0.1 * np.sin(5 * angles)], -1)
+    forces, d = jg.DisturbanceSet.forces(1.0), np.random.default_rng(1).uniform(0, 0.05, (3, 3))
 
     def margin(batch: tuple[int, ...], d, load=None) -> jax.Array:
-        return jg.largest_disturbance(one_more(normals, batch), forces, load, cone_edges=4, cone_margin=d).margin
+        return jg.largest_disturbance(one_more(normals, batch), forces, load, cone_edges=3, cone_margin=d).margin
 
-    row, contact = margin((), d), margin((4,), d)
-    assert row.shape == () and contact.shape == (4,)
+    contact, row = margin((3,), d), margin((), d)
+    assert contact.shape == (3,) and row.shape == ()
     assert abs(row - contact[0]) > 1e-4 and abs(contact[0] - contact[1]) > 1e-4
-    # Each contact's value in all of its rows, each grasp's in all contacts.
-    same = jnp.broadcast_to(jnp.asarray(d[0])[:, None], (4, 4))
-    np.testing.assert_allclose(margin((), same), contact[0], rtol=1e-9)
-    np.testing.assert_allclose(margin((4,), d[:1]), jnp.full(4, contact[0]), rtol=1e-9)
-    grasp = margin((4,), d[:, 0])
-    np.testing.assert_allclose(margin((), jnp.full((4, 4), d[2, 0])), grasp[2], rtol=1e-9)
-    # Other arguments may bring the batch, and a mapped axis is none.
-    loads = np.zeros((4, 6))
+    # A contact's value in all of its rows; a mapped axis is none.
+    np.testing.assert_allclose(margin((), np.tile(d[1:2].T, (1, 3))), contact[1], rtol=1e-9)
     np.testing.assert_allclose(jax.vmap(partial(margin, ()))(jnp.asarray(d)), contact, rtol=1e-9)
-    np.testing.assert_allclose(margin((), d[:, 0], loads), grasp, rtol=1e-9)
+    # A length of one is shared, and other arguments may bring the batch.
     shape = lambda batch, *given: jax.eval_shape(partial(margin, batch), *given).shape  # noqa: E731
-    assert shape((4,), d[None]) == shape((4,), np.stack([d] * 4)) == shape((), d[None], loads) == (4,)
-    assert shape((), d[0]) == ()
+    assert shape((3,), d[:1]) == shape((3,), d[0]) == shape((3,), d[None]) == shape((), d, np.zeros((3, 6))) == (3,)
+    assert shape((), d[0]) == shape((), d[0, 0]) == ()
 
 
 def test_shapes_without_a_meaning_are_refused() -> None:
@@ -224,18 +219,15 @@ def test_bad_values_mark_their_own_grasp_unless_the_contact_is_absent(program: s
 
 
 def test_contacts_without_friction_keep_nothing_in_reserve() -> None:
-    normals = np.concatenate([np.eye(3), -np.eye(3)])
+    batch, _ = grasps()
+    friction, unloaded = batch.friction.copy(), ~batch.load.any(-1)
+    friction[:, 1] = 0
+    batch = chain.Batch(batch.positions, batch.frames, friction, batch.max_force, batch.wrenches, batch.load)
+    assert unloaded.sum() > 5
     for program in ("21", "16"):
-        for d, status in ((0.0, jg.Status.SOLVED), (0.1, jg.Status.INFEASIBLE)):
-            friction, margins = np.full(6, 0.6), np.full(6, 0.05)
-            friction[2], margins[2] = 0, d
-            contacts = jg.Contacts.from_normals(normals, normals, friction=friction, max_force=2.0)
-            forces = jg.DisturbanceSet.forces(1.0)
-            if program == "21":
-                ours = jg.largest_disturbance(contacts, forces, cone_margin=margins)
-            else:
-                ours = jg.formulation_margin(contacts, forces, program, cone_margin=margins)
-            assert ours.status == status, (program, d, ours.status, ours.margin)
+        for d, status in ((0.0, jg.Status.SOLVED), (0.01, jg.Status.INFEASIBLE)):
+            found = solve(program, batch, np.tile([0, d, 0], (len(batch), 1)))
+            np.testing.assert_array_equal(np.asarray(found.status)[unloaded], status)
 
 
 @pytest.mark.thorough
