@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -18,6 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import jaxgrasp as jg  # noqa: E402
 from benchmarks.suite import chain  # noqa: E402
 from jaxgrasp import kernels  # noqa: E402
+from jaxgrasp.robustness import grasps as grasps_room  # noqa: E402
+from jaxgrasp.robustness.auditing import setting  # noqa: E402
 
 SAME = 1e-7
 """Of max(margin, Lambda), and of max(effort, 1e-3 f_max^2)."""
@@ -228,6 +231,26 @@ def test_contacts_without_friction_keep_nothing_in_reserve() -> None:
         for d, status in ((0.0, jg.Status.SOLVED), (0.01, jg.Status.INFEASIBLE)):
             found = solve(program, batch, np.tile([0, d, 0], (len(batch), 1)))
             np.testing.assert_array_equal(np.asarray(found.status)[unloaded], status)
+
+
+@pytest.mark.parametrize("program", ["21", "13"])
+def test_the_audit_counts_every_row(program: str, monkeypatch) -> None:
+    """Answers for no margin at all where one is asked for."""
+    batch, d = grasps()
+    run, instead = grasps_room._run, []
+
+    def without(function, data, options):
+        instead.append(run(function, replace(data, cone_margin=jnp.zeros_like(data.cone_margin)), options))
+        return instead[-1]
+
+    right = np.asarray(solve(program, batch, d).status)
+    monkeypatch.setattr(grasps_room, "_run", without)
+    monkeypatch.setattr(setting, "report", lambda failed, lanes: None)
+    found = np.asarray(solve(program, batch, d).status)
+    claimed = np.asarray((instead[0] if program == "21" else instead[0][program])[0].status)[: len(batch)]
+    wrong = (right == jg.Status.INFEASIBLE) & (claimed == jg.Status.SOLVED)
+    assert wrong.sum() >= 3
+    np.testing.assert_array_equal(found[wrong], jg.Status.NOT_VERIFIED)
 
 
 @pytest.mark.thorough
