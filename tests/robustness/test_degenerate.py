@@ -142,7 +142,11 @@ CASES = {
         *PAIRS, disturbances=FORCES[[0, 3]], required=load(100.0), margin=-92.939499314783, status="INFEASIBLE"
     ),
     "pairs, six forces, load far out of reach": star(*PAIRS, required=load(1e4), margin=-5552.0, status="INFEASIBLE"),
-    "frictionless octahedron": star(*OCTAHEDRON, friction=0.0, margin=0.0),
+    "frictionless octahedron": star(*OCTAHEDRON, friction=0.0, margin=F),
+    "frictionless octahedron, torques": star(*OCTAHEDRON, friction=0.0, disturbances=torques(0, 1), margin=0.0),
+    "frictionless triangle, forces in its plane": star(
+        *TRIANGLE, friction=0.0, disturbances=FORCES[[0, 1, 3, 4]], margin=0.75 * F
+    ),
     "all normals alike, no force closure": Case(TABLE + Z, np.tile(Z, (3, 1)), margin=0.0),
     "nothing to squeeze against, light load": Case(TABLE - Z, np.tile(-Z, (3, 1)), required=load(0.1), margin=0.0),
 }
