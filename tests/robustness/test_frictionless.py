@@ -358,7 +358,7 @@ def test_least_total_effort_is_clarabels():
     solved = np.asarray(found.status) == jg.Status.SOLVED
     assert solved.sum() > 12
     for i in np.flatnonzero(solved):
-        wanted = chain.least_effort(batch.case(i), asked[i])
+        wanted = chain.least_total_effort(batch.case(i), asked[i])
         assert abs(found.effort[i] - wanted) <= 1e-6 * max(wanted, 1e-3 * batch.max_force[i].max() ** 2)
     smooth = batch.friction[solved] == 0
     assert not np.asarray(found.forces)[solved][smooth][:, :2].any()
