@@ -41,9 +41,10 @@ class Case:
 
     @cached_property
     def G(self) -> np.ndarray:
-        """(6, 3 n_c) for forces in units of f_max."""
-        moments = np.cross(self.positions[:, :, None], self.frames, axis=1)
-        blocks = np.concatenate([self.frames, moments], 1) * self.max_force[:, None, None]
+        """(6, 3 n_c) for forces in units of f_max; zero for tangents of contacts without friction."""
+        frames = self.frames * np.stack([self.friction > 0] * 2 + [self.friction >= 0], -1)[:, None]
+        moments = np.cross(self.positions[:, :, None], frames, axis=1)
+        blocks = np.concatenate([frames, moments], 1) * self.max_force[:, None, None]
         return self.units[:, None] * blocks.transpose(1, 0, 2).reshape(6, -1)
 
     @cached_property
@@ -95,6 +96,8 @@ class Case:
             facets = np.stack(
                 [np.cos(angles), np.sin(angles), np.full(self.edges, mu * np.cos(np.pi / self.edges))], -1
             )
+            # Without friction the finger does not pull.
+            facets = facets if mu > 0 else np.tile([0, 0, np.cos(np.pi / self.edges)], (self.edges, 1))
             blocks.append(np.vstack([facets, [[0, 0, -1.0]]]))
         shares = self.cone_margins / self.max_force[:, None]
         sides = np.hstack([-shares + np.zeros((len(blocks), self.edges)), np.ones((len(blocks), 1))])
@@ -106,7 +109,8 @@ class Case:
         shares = np.broadcast_to(self.cone_margins / self.max_force[:, None], (n, 1))[:, 0]
         for i, mu in enumerate(self.friction):
             e = np.eye(3 * n)[3 * i : 3 * i + 3]
-            parts.append(("q", np.stack([mu * e[2], -e[0], -e[1]]), np.array([-shares[i], 0, 0])))
+            coulomb = ("q", np.stack([mu * e[2], -e[0], -e[1]]), np.array([-shares[i], 0, 0]))
+            parts.append(coulomb if mu > 0 else ("l", e[2:], -shares[i : i + 1]))
             if norm_bound:
                 parts.append(("q", np.vstack([np.zeros((1, 3 * n)), -e]), np.array([1.0, 0, 0, 0])))
             else:

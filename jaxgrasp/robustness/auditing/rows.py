@@ -179,7 +179,7 @@ def _weighted(
     if compliance is None:
         return plain.inverse
     n = problem.present.shape[-1]
-    there = jnp.repeat(problem.present, 3, -1)
+    there = problem.transmits.reshape(-1, 3 * n)
     if compliance.shape[-2:] != (3 * n, 3 * n):
         blocks = jnp.eye(n, dtype=rows.dtype)[:, None, :, None] * compliance[:, :, :, None, :]
         compliance = blocks.reshape(blocks.shape[0], 3 * n, 3 * n)

@@ -279,6 +279,7 @@ class Chain(Audited):
         else:
             # Nothing ties the directions together but the smallest of their margins.
             sizes = jnp.stack([problem.friction * problem.max_force] * 2 + [problem.max_force], 1)
+            sizes *= jnp.swapaxes(problem.transmits, 1, 2)
             forces = jnp.moveaxis(point.x[..., :-1] * sizes[..., None], (3, 2), (1, 2))
             wrenches = disturbed_wrenches(problem, directions)
             looked_at = jnp.isfinite(directions) & (directions > 0)

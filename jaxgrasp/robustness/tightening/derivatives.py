@@ -186,8 +186,7 @@ def _central_adjoint(
     iterate = scale_point(problem, program, point, unit, central_kappa(objective, grasps, unit))
     where_usable = lambda x: None if x is None else jnp.where(point.usable, x, 0)
     forces = jnp.where(point.usable, point.forces, 0)
-    scales = jnp.stack([program.tangential, program.tangential, program.normal])
-    units = _Units(scales, program.row_units(), unit)
+    units = _Units(program.force_units, program.row_units(), unit)
     ct = cotangents._replace(**{name: where_usable(part) for name, part in cotangents._asdict().items()})
 
     # K m = c.
