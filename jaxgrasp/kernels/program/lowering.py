@@ -18,6 +18,9 @@ from jaxgrasp.kernels.program.rules import ELEMENTWISE, RULES
 # Unroll limits, in rounds: of any loop, since the first round often starts from zeros and nobody reads all that the
 # last one leaves; of loops whose body reads the counter; of loops that stack results.
 _SHORT, _COUNTED, _STACKED = 2, 16, 64
+# A loop whose body reads the counter stays one where its rounds have more entries than this in all: code this long
+# gains nothing by knowing the counter, and compiles for as long as there are rounds.
+_MOST_UNROLLED = 1 << 13
 # The type of the operands of operations that have instructions for one type alone.
 _ONLY = {"div": "f", "abs": "f", "and": "b", "or": "b", "xor": "b", "not": "b"}
 # The most entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
@@ -122,10 +125,18 @@ def _entries(jaxpr: Jaxpr) -> int:
     total = 0
     for eqn in jaxpr.eqns:
         total += sum(math.prod(aval_of(v).shape) for v in eqn.outvars)
-        length = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
         inner = sum(_entries(j) for j in jaxprs_in_params(eqn.params))
-        total += inner * (length if length <= _STACKED else 1)
+        total += inner * (eqn.params["length"] if eqn.primitive.name == "scan" and _may_unroll(eqn.params) else 1)
     return total
+
+
+def _may_unroll(params: dict, counted: bool = True) -> bool:
+    """Tell whether the rounds of a scan are written one after the other, where its body reads its counter or not."""
+    body, length = params["jaxpr"], params["length"]
+    stacks = len(body.jaxpr.outvars) > params["num_carry"]
+    if length <= _SHORT or (stacks and length <= _STACKED):
+        return True
+    return counted and length <= _COUNTED and length * _entries(body.jaxpr) <= _MOST_UNROLLED
 
 
 class _Lowering:
@@ -194,7 +205,7 @@ class _Lowering:
         # Integers that only count rounds are not carried: they are the loop's counter and where they start.
         counters = _counters(body.jaxpr, n_consts, n_carry, carry)
         counted = xs or any(used for _, used in counters.values())
-        if length <= _SHORT or (counted and length <= _COUNTED) or (n_ys and length <= _STACKED):
+        if _may_unroll(params, bool(counted)):
             return self.unroll(params, consts, carry, xs)
         if n_ys or reverse:
             raise Unsupported("a long loop with stacked results")
