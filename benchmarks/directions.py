@@ -21,8 +21,8 @@ import jaxgrasp as jg  # noqa: E402
 from benchmarks.suite import problems  # noqa: E402
 from benchmarks.suite.clock import say, warn_if_busy  # noqa: E402
 
-BATCH, CONTACTS, ROUNDS = 4096, 4, 40
-SHARED = (6, 16, 64, 128, 256, 512, 1024, 2048, 4096)
+BATCH, CONTACTS, ROUNDS = 4096, 4, 20
+SHARED = (6, 64, 128, 256, 1024, 4096)
 OWN = (6, 64, 256, 1024)
 """Of sets that each grasp has for itself: 1,024 directions are 200 MB in float64."""
 
@@ -106,9 +106,9 @@ def main() -> None:
     text = f"""# Margins of many directions
 
 `python -m benchmarks.directions`, {platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}, load {load:.1f}.
-{BATCH:,} grasps of {CONTACTS} contacts; processor milliseconds, best of {ROUNDS} rounds by turns. "Beyond" is what a margin
-takes more than S_1 and S_2 by themselves, without an audit and with the default one; in brackets, over that of six
-directions.
+{BATCH:,} grasps of {CONTACTS} contacts; processor milliseconds, best of {ROUNDS} rounds by turns. "Beyond" is what a
+margin takes more than S_1 and S_2 by themselves, without an audit and with the default one; in brackets, over that of
+six directions.
 "first" is the processor time of the first call, compilation included.
 
 {HEAD}

@@ -14,6 +14,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxgrasp.compiling import compiled
+from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.robustness.auditing import setting
 from jaxgrasp.robustness.auditing.problem import every, picked
 from jaxgrasp.robustness.auditing.setting import audit
@@ -77,11 +78,10 @@ def audited(
     form = setting.chosen_form()
     if form == "off" or not isinstance(kernel, Audited) or jax.tree.leaves(out)[0].size == 0:
         return out
-    stride = 1 if form == "strict" else setting.STRIDE
     still = jax.lax.stop_gradient((data, options, out))
     first = jax.tree.leaves(out)[0]
     pace = "brief" if isinstance(first, Tracer) or first.size > _FEW else "soon"
-    verdicts, failed = _JUDGES[pace](kernel, stride, *still, np.int32(setting.next_turn()))
+    verdicts, failed = _JUDGES[pace](kernel, form, *still, np.int32(setting.next_turn()))
     if not isinstance(failed, Tracer):
         if not int(failed):
             return out
@@ -92,17 +92,18 @@ def audited(
 
 
 def _verdicts(
-    kernel: Any, stride: int, data: GraspData, options: Options, out: Tree, turn: jax.Array
+    kernel: Any, form: str, data: GraspData, options: Options, out: Tree, turn: jax.Array
 ) -> tuple[Tree, jax.Array]:
     """What the kernel judges, (*batch), and how many answers failed."""
     arguments = lay_out(data, options)
     lead = len(arguments.batch)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), out)
     lanes = jax.tree.leaves(flat)[0].shape[0]
-    verdicts = kernel.judge(arguments, flat, stride == 1)
-    if stride > 1:
+    verdicts = kernel.judge(arguments, flat, form == "strict")
+    if form != "strict":
+        vertices = sum(t.wrenches.shape[-2] for t in data.disturbances.terms if isinstance(t, Vertices))
         # Where it is known only when an exported program runs how many there are, all are looked at.
-        step = stride if isinstance(lanes, int) and lanes > _SMALL else 1
+        step = setting.step_of(lanes, vertices) if isinstance(lanes, int) and lanes > _SMALL else 1
         some = jax.tree.map(lambda x: every(x, turn % step, step), flat)
         spots = kernel.spot(picked(arguments, turn % step, step), some)
         refuted = partial(_refuted, turn=turn % step, step=step)

@@ -12,8 +12,9 @@ from jaxgrasp import kernels
 
 SETTING = "JAXGRASP_AUDIT"
 FORMS = ("sampled", "strict", "off")
-# The default form recomputes S_1 and S_2 for one lane in this many, another one at every call.
-STRIDE = 16
+# The default form recomputes S_1 and S_2 for one lane in this many, another one at every call: of sets with up to so
+# many vertices. Of larger ones it looks at as many lanes fewer, so that it costs as much, but at `LEAST` of a batch.
+STRIDE, VERTICES, LEAST = 16, 128, 8
 
 # A context of JAX's, so that programs are traced anew where it changes.
 _form = jax.make_user_context(None)
@@ -31,7 +32,8 @@ def audit(form: str) -> Iterator[None]:
 
     Args:
         form: "sampled", the default: every lane with the S_1 and S_2 that its solver used, and one lane in sixteen,
-            other ones at each call, with S_1 and S_2 computed anew; of the chain and of (11) the forces alone.
+            other ones at each call, with S_1 and S_2 computed anew (of sets with more than 128 vertices as many lanes
+            fewer, eight at least); of the chain and of (11) the forces alone.
             "strict": every lane with everything computed anew. "off": no audit.
 
     Raises:
@@ -47,8 +49,13 @@ def chosen_form() -> str:
 
 
 def next_turn() -> int:
-    """Which lane of every `STRIDE` is recomputed this time."""
-    return next(_turns) % STRIDE
+    """Count the calls, which look at one lane of every few after the other."""
+    return next(_turns) % (1 << 30)
+
+
+def step_of(lanes: int, vertices: int) -> int:
+    """Find of how many lanes one is recomputed in a batch of so many, for a set of so many vertices."""
+    return max(STRIDE, min(STRIDE * -(-vertices // VERTICES), lanes // LEAST))
 
 
 def report(failed: int, lanes: int) -> None:
