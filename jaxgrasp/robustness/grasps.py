@@ -13,7 +13,7 @@ from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.actuation import Actuation
-from jaxgrasp.contact.compliance import Compliance, inverse_root
+from jaxgrasp.contact.compliance import Compliance, inverse_root, is_full
 from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance.terms import Term
@@ -64,7 +64,7 @@ class Grasps:
     vertex_inverse_roots: jax.Array | None
     """M for each vertex of the disturbance set, along the leading axis."""
     weight_roots: jax.Array | None
-    """(3, 3, n, *lanes), R with R'R = Q_0; None for Q_0 = I."""
+    """R with R'R = Q_0, (3, 3, n, *lanes) for blocks or (3 n, 3 n, *lanes) for a full Q_0; None for Q_0 = I."""
     options: Options
     """The options of the call, lanes trailing, made safe as well."""
     actuated: Actuated | None
@@ -74,6 +74,12 @@ class Grasps:
     def rows(self) -> jax.Array:
         """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
         return stack_rows(self.columns, self.actuated)
+
+    @property
+    def full_weights(self) -> bool:
+        """Whether Q_0 is one full matrix."""
+        weights = self.options.effort_weights
+        return weights is not None and is_full(weights, len(self.present))
 
 
 def over_grasps(function: BatchedFunction, data: GraspData, options: Options | None = None) -> Any:
@@ -204,8 +210,9 @@ def _roots_of_weights(
     if masked is None:
         return None, None, jnp.array(True)
     usable = inverse_root(masked, active.shape[0])[1]
-    definite = jnp.where(valid & usable, masked, jnp.eye(3, dtype=masked.dtype)[..., None])
-    roots = linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
+    axes = (0, 1) if is_full(masked, active.shape[0]) else (1, 2)
+    definite = jnp.where(valid & usable, masked, jnp.eye(masked.shape[1], dtype=masked.dtype)[..., None])
+    roots = linalg.cholesky(jnp.moveaxis(definite, axes, (-1, -2)))
     return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
 
 
@@ -284,7 +291,7 @@ def _masked(matrices: jax.Array | None, active: jax.Array) -> jax.Array | None:
     """Blocks or full matrices of contacts with the absent ones' rows and columns replaced by the identity's."""
     if matrices is None:
         return None
-    full = matrices.shape[:2] == (3 * active.shape[0],) * 2
+    full = is_full(matrices, active.shape[0])
     eye = jnp.eye(matrices.shape[1], dtype=matrices.dtype).reshape(
         (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (active.ndim - 1)
     )
