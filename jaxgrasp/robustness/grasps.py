@@ -59,6 +59,9 @@ class Grasps:
     """The disturbance set, moments in N m; leaves may have lanes of size 1."""
     extents: tuple[jax.Array, ...]
     """The largest |w_i| of every term of the disturbance set, (6, *lanes) each, N and N m."""
+    compliance: jax.Array | None
+    """Q of each vertex of the disturbance set, or one for all, along the leading axis: blocks (n, 3, 3, *lanes) or full
+    (3 n, 3 n, *lanes), the identity for absent contacts; None for Q = I."""
     inverse_root: jax.Array | None
     """M with M M' = Q^-1, see `inverse_root`; None for Q = I."""
     vertex_inverse_roots: jax.Array | None
@@ -133,7 +136,7 @@ def admit(inputs: Inputs) -> Grasps:
     load = data.required_wrench
     assert load is not None
     valid = _usable_contacts(contacts)
-    root, vertex_roots, usable = _roots_of_compliance(data.compliance, active)
+    compliance, root, vertex_roots, usable = _roots_of_compliance(data.compliance, active)
     valid &= usable
     weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, active, valid)
     valid &= usable
@@ -171,6 +174,7 @@ def admit(inputs: Inputs) -> Grasps:
         reserve=jnp.where(valid, data.cone_margin, 0),
         terms=data.disturbances.terms,
         extents=inputs.extents,
+        compliance=compliance,
         inverse_root=root,
         vertex_inverse_roots=vertex_roots,
         weight_roots=weight_roots,
@@ -189,17 +193,23 @@ def _usable_contacts(contacts: Contacts) -> jax.Array:
 
 def _roots_of_compliance(
     compliance: jax.Array | Compliance | None, active: jax.Array
-) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
-    """M with M M' = Q^-1, the same of every vertex of the set, and whether Q is positive definite, (*lanes)."""
+) -> tuple[jax.Array | None, jax.Array | None, jax.Array | None, jax.Array]:
+    """Q, M with M M' = Q^-1, the same of every vertex of the set, and whether Q is positive definite, (*lanes)."""
     n = active.shape[0]
+    if compliance is None:
+        return None, None, None, jnp.array(True)
+    definite = lambda Q, usable: jnp.where(usable, Q, jnp.eye(Q.shape[-2], dtype=Q.dtype)[..., None])
     if not isinstance(compliance, Compliance):
-        root, usable = inverse_root(_masked(compliance, active), n)
-        return root, None, usable
+        masked = _masked(compliance, active)
+        root, usable = inverse_root(masked, n)
+        return definite(masked, usable)[None], root, None, usable
     # One Q a direction: the directions trail the lanes while the roots are taken.
     last = jnp.moveaxis(compliance.per_vertex, 0, -1)
-    roots, usable = inverse_root(_masked(last, active[..., None]), n)
-    assert roots is not None
-    return None, jnp.moveaxis(roots, -1, 0), usable.all(-1)
+    masked = _masked(last, active[..., None])
+    roots, usable = inverse_root(masked, n)
+    assert roots is not None and masked is not None
+    usable = usable.all(-1)
+    return definite(jnp.moveaxis(masked, -1, 0), usable), None, jnp.moveaxis(roots, -1, 0), usable
 
 
 def _roots_of_weights(
