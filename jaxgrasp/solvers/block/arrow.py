@@ -47,7 +47,6 @@ from jaxgrasp.solvers.small_matrices import (
     unflatten,
 )
 
-
 # The entries of a symmetric 3x3 matrix that `cholesky_3x3` takes.
 _PAIRS = [(a, b) for a in range(3) for b in range(a + 1)]
 

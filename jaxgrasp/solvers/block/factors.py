@@ -1,4 +1,4 @@
-"""Cholesky factors of P, the blocks' part of the Newton system of `kkt`: one for every block, or one for all of them."""
+"""Cholesky factors of P, the blocks' part of the Newton system of `kkt`: of every block, or of all of them at once."""
 
 from typing import NamedTuple
 
