@@ -215,7 +215,7 @@ def _roots_of_compliance(
 def _roots_of_weights(
     weights: jax.Array | None, active: jax.Array, valid: jax.Array
 ) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
-    """Q_0 with the identity for absent contacts, R with R'R = Q_0, and whether it is positive definite, (*lanes)."""
+    """Q_0, the identity for absent contacts and bad lanes, R with R'R = Q_0, and whether it is definite, (*lanes)."""
     masked = _masked(weights, active)
     if masked is None:
         return None, None, jnp.array(True)
@@ -223,7 +223,7 @@ def _roots_of_weights(
     axes = (0, 1) if is_full(masked, active.shape[0]) else (1, 2)
     definite = jnp.where(valid & usable, masked, jnp.eye(masked.shape[1], dtype=masked.dtype)[..., None])
     roots = linalg.cholesky(jnp.moveaxis(definite, axes, (-1, -2)))
-    return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
+    return definite, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
 
 
 def _admit_options(options: Options, valid: jax.Array) -> tuple[Options, jax.Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -279,6 +280,33 @@ def inputs(batch: problems.Batch, **more: np.ndarray) -> dict[str, jax.Array]:
     normals = np.asarray(batch.frames)[..., 2]
     given = {"positions": batch.positions, "normals": normals, "friction": batch.friction, **more}
     return {name: jnp.asarray(value) for name, value in given.items()}
+
+
+@pytest.mark.thorough
+def test_bad_matrices_have_no_gradient_and_harm_no_neighbour():
+    batch, weights = small()
+    contacts, disturbances, load, reserve = harness.data_of(batch)
+    sample, Q, others = small_sample()
+
+    def least(x):
+        moved = replace(contacts, friction=x["friction"])
+        given = {"effort_weights": x["weights"], "cone_margin": reserve}
+        return jg.least_effort(moved, disturbances, np.full(8, 0.01), load, **given).effort
+
+    def total(x):
+        moved = replace(sample, friction=x["friction"])
+        return total_effort(moved, PAIRS[-1][0], x["Q"], x["weights"], np.full(8, 0.02)).effort
+
+    cases = [(least, {"friction": contacts.friction, "weights": weights})]
+    cases += [(total, {"friction": sample.friction, "weights": others, "Q": Q})]
+    for value, x in cases:
+        slope = jax.grad(lambda x, value=value: jnp.nansum(value(x)))
+        good = slope(jax.tree.map(jnp.asarray, x))
+        for name in x.keys() - {"friction"}:
+            bad = slope(jax.tree.map(jnp.asarray, {**x, name: spoilt(np.asarray(x[name]))}))
+            for part in x:
+                assert not np.any(bad[part][1:4]), (name, part)
+                np.testing.assert_array_equal(np.delete(bad[part], [1, 2, 3], 0), np.delete(good[part], [1, 2, 3], 0))
 
 
 @pytest.mark.thorough
