@@ -274,12 +274,15 @@ def check_gradients(values, xs: list[dict], step: float, kinks: float, counted: 
             if name in ("Q", "weights"):
                 along = along + np.swapaxes(along, -1, -2)
             size = float(jnp.abs(start).max())
-            sides = [np.asarray(values({**x, name: start + sign * step * size * along})) for sign in (1, -1, 2, -2)]
-            slope, twice = (sides[0] - sides[1]) / (2 * step), (sides[2] - sides[3]) / (4 * step)
-            slope, twice = slope / sizes, twice / sizes
+            # Central differences of three steps; two of them without the error of second order.
+            ends = lambda h: (values({**x, name: start + sign * h * size * along}) for sign in (1, -1))  # noqa: B023, E731
+            half, one, two = (
+                np.subtract(*map(np.asarray, ends(h))) / (2 * h * sizes) for h in step * 2.0 ** np.arange(-1, 2)
+            )
+            slope, finer = (4 * one - two) / 3, (4 * half - one) / 3
             unit = np.maximum(np.abs(slope), 1)
-            # Where steps of two lengths do not tell the same slope, there is a kink between.
-            smooth = known & (np.abs(slope - twice) <= kinks * unit)
+            # Where they do not agree there is a kink between.
+            smooth = known & (np.abs(slope - finer) <= kinks * unit)
             assert smooth.sum() >= counted * known.sum(), (name, smooth.sum(), known.sum())
             ours = [np.sum(np.asarray(part[name] * along).reshape(len(here), -1), -1) * size for part in found]
             errors = (np.abs(np.stack(ours, -1) - slope) / unit)[smooth]
@@ -371,7 +374,7 @@ def test_gradients_of_11(kinds):
         )
         options = {"compliance": compliance(x["Q"], kinds[0]), "effort_weights": x["weights"]}
         found = jg.least_total_effort(moved, vertices, asked, batch.load, **options)
-        return jnp.where(some, found.effort, jnp.nan)[:, None]
+        return jnp.where(some, found.lower_bound, jnp.nan)[:, None]
 
-    # Efforts are found to 1e-8, of which a step of this length makes 1e-5 at most.
-    check_gradients(values, [inputs(batch, Q=Q, weights=weights)], 1e-3, 1e-5, 0.5)
+    # Of the two bounds, which both vary as the effort does, the lower one is the closer: within 1e-9 as a rule.
+    check_gradients(values, [inputs(batch, Q=Q, weights=weights)], 1e-4, 2e-6, 0.6)
