@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import fold, fold_last
 from jaxgrasp.robustness.auditing import hidden
 from jaxgrasp.robustness.auditing.problem import Hand, Problem, facets, problem_of
@@ -325,20 +326,35 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
         residual, held = residual + more, held + value + spent - pull * asked
         assert solution.actuator_multipliers is not None
         sound &= _min(solution.actuator_multipliers, 2) >= 0
-    if problem.weights is None:
-        largest, weighed, answered = 1.0, forces, residual
-    else:
-        both = problem.transmits[..., None] & problem.transmits[..., None, :]
-        weights = jnp.where(both, problem.weights, jnp.eye(3, dtype=forces.dtype))
-        largest = _max(jnp.abs(weights), 2)
-        weighed, answered = jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
+    largest, weighed, answered = _weighed(problem, forces, residual)
     own = 0.5 * _sum(forces * weighed)
     # Of every contact the better of two bounds: without its limits, and by the tangent at f_0 within them.
-    least = jnp.maximum(-0.5 * _sum(residual * answered), -own - _lost(problem, weighed + residual))
-    effort, lower = (_sum(jnp.where(there, part, 0)) for part in (own, least))
+    bounds = -0.5 * _sum(residual * answered), -own - _lost(problem, weighed + residual)
+    if problem.weights is not None and problem.weights.ndim < 4:
+        # A full Q_0 bounds all contacts at once.
+        effort, *bounds = (_sum(jnp.where(there, part, 0)) for part in (own, *bounds))
+        lower = jnp.maximum(*bounds)
+    else:
+        effort, lower = (_sum(jnp.where(there, part, 0)) for part in (own, jnp.maximum(*bounds)))
     unit = _max(jnp.where(there, largest * problem.max_force**2, 0))
     near = CLOSED[dtype] * jnp.maximum(effort, 1e-3 * unit)
     return sound & (effort - (lower - held) <= near) & (jnp.abs(effort - solution.effort) <= near)
+
+
+def _weighed(problem: Problem, forces: jax.Array, residual: jax.Array) -> tuple:
+    """The largest entry of Q_0 (of a contact, where it is of blocks), Q_0 f and Q_0^-1 r, (lanes, n, 3)."""
+    weights, there = problem.weights, problem.transmits
+    if weights is None:
+        return 1.0, forces, residual
+    eye = jnp.eye(weights.shape[-1], dtype=forces.dtype)
+    if weights.ndim == 4:
+        weights = jnp.where(there[..., None] & there[..., None, :], weights, eye)
+        return _max(jnp.abs(weights), 2), jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
+    there = there.reshape(there.shape[0], -1)
+    weights = jnp.where(there[:, :, None] & there[:, None], weights, eye)
+    flat = lambda x: x.reshape(*there.shape, 1)
+    weighed, answered = weights @ flat(forces), linalg.solve_positive(weights, flat(residual))
+    return _max(jnp.abs(weights), 2)[:, None], weighed.reshape(forces.shape), answered.reshape(forces.shape)
 
 
 def _divided(vectors: jax.Array, matrices: jax.Array) -> jax.Array:

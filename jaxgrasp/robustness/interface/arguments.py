@@ -94,8 +94,9 @@ class Options:
     """kappa of the central point that is asked for in place of the optimum."""
     cutoff: Float[Array, "*batch"] | None = None
     """The least margin that is of interest."""
-    effort_weights: Float[Array, "*batch contacts 3 3"] | None = None
-    """Q_0, blocks in contact frames; None is the identity."""
+    effort_weights: Float[Array, "..."] | None = None
+    """Q_0 as blocks (*batch, contacts, 3, 3) or full (*batch, 3 contacts, 3 contacts), contact frames; None is the
+    identity."""
 
 
 def optional_float(name: str, value: ArrayLike | None) -> jax.Array | None:
@@ -164,7 +165,9 @@ def trailing_shapes(data: GraspData, options: Options) -> tuple[GraspData, Optio
         cone_margin=None,
         actuation=actuation,
     )
-    option_shapes = replace(alike(options, ()), effort_weights=alike(options.effort_weights, (n, 3, 3)))
+    weights = options.effort_weights
+    weights = None if weights is None else _matrix_shape("effort_weights", weights, n)
+    option_shapes = replace(alike(options, ()), effort_weights=weights)
     return replace(shapes, cone_margin=_cone_margin_shape(data, options, shapes, option_shapes)), option_shapes
 
 
@@ -179,8 +182,6 @@ def lay_out(data: GraspData, options: Options) -> Arguments:
     _check_vertices(data)
     _check_jacobian(data)
     shapes, option_shapes = trailing_shapes(data, options)
-    if options.effort_weights is not None:
-        as_float("effort_weights", options.effort_weights, (data.contacts.n_c, 3, 3))
     disturbances = data.disturbances
     batch = broadcast_batch(
         contacts=data.contacts.batch_shape,
@@ -270,13 +271,7 @@ def _compliance_shape(data: GraspData) -> Any:
     if compliance is None:
         return None
     if not isinstance(compliance, Compliance):
-        array = as_float("compliance", compliance, ("rows", "columns"))
-        for shape in ((n, 3, 3), (3 * n, 3 * n)):
-            if array.shape[-len(shape) :] == shape:
-                return Trailing(shape)
-        raise ValueError(
-            f"compliance: got shape {array.shape}, wanted (*batch, {n}, 3, 3) or (*batch, {3 * n}, {3 * n})"
-        )
+        return _matrix_shape("compliance", compliance, n)
     (vertices,) = data.disturbances.terms
     assert isinstance(vertices, Vertices)
     array, count = compliance.per_vertex, vertices.wrenches.shape[-2]
@@ -287,3 +282,16 @@ def _compliance_shape(data: GraspData) -> Any:
         f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or "
         f"(*batch, {count}, {3 * n}, {3 * n}), one Q for each of the {count} wrenches"
     )
+
+
+def _matrix_shape(name: str, matrices: jax.Array, n: int) -> Trailing:
+    """The shape that Q or Q_0 has to end in: blocks of contacts, or all contacts together.
+
+    Raises:
+        ValueError: it ends in neither.
+    """
+    array = as_float(name, matrices, ("rows", "columns"))
+    for shape in ((n, 3, 3), (3 * n, 3 * n)):
+        if array.shape[-len(shape) :] == shape:
+            return Trailing(shape)
+    raise ValueError(f"{name}: got shape {array.shape}, wanted (*batch, {n}, 3, 3) or (*batch, {3 * n}, {3 * n})")

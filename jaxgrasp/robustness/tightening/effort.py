@@ -46,8 +46,9 @@ def least_effort(
         margin: lambda (*batch,), >= 0; usually a share, say 75 %, of (21)'s.
         required_wrench: b (*batch, 6), N and N m; None is zero.
         compliance: Q, as in `largest_disturbance`.
-        effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the
-            identity.
+        effort_weights: Q_0, contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3) or full
+            (*batch, 3 n_c, 3 n_c), for least joint torques `Actuation.joint_torque_weights`; None is the identity.
+            Full ones take dense linear algebra, blocks do not.
         cone_edges: n_e.
         cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`.
         smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the
