@@ -14,6 +14,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxgrasp.compiling import compiled
+from jaxgrasp.lanes.fence import fences
 from jaxgrasp.robustness.auditing import setting
 from jaxgrasp.robustness.auditing.problem import every, picked
 from jaxgrasp.robustness.auditing.setting import audit
@@ -99,7 +100,8 @@ def _verdicts(
     lead = len(arguments.batch)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), out)
     lanes = jax.tree.leaves(flat)[0].shape[0]
-    verdicts = kernel.judge(arguments, flat, stride == 1)
+    with fences(jax.default_backend() == "cpu"):
+        verdicts = kernel.judge(arguments, flat, stride == 1)
     if stride > 1:
         # Where it is known only when an exported program runs how many there are, all are looked at.
         step = stride if isinstance(lanes, int) and lanes > _SMALL else 1

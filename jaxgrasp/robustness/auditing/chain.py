@@ -42,7 +42,7 @@ def admissible(problem: Problem, forces: jax.Array, exact: bool, cone_edges: int
         if norm_bound:
             within &= jnp.sqrt((forces * forces).sum(-1)) <= most + slack
     else:
-        within = (row_values(problem, forces, cone_edges)[0] <= slack[..., None]).all(-1)
+        within = fold(jnp.logical_and, [row <= slack for row in row_values(problem, forces, cone_edges)[0]])
     return ((within & (-normal <= most + slack)) | ~problem.present).all(-1)
 
 

@@ -8,6 +8,7 @@ G f = b prove one from above, whatever they are: for every admissible f with lam
 with rows A f + sigma lambda <= h, and |f_t| <= mu f_max, |f_n| <= f_max bound r'f.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -16,9 +17,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold, fold_last
+from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.robustness.auditing import hidden
-from jaxgrasp.robustness.auditing.problem import Hand, Problem, facets, problem_of
-from jaxgrasp.robustness.auditing.rows import Range, Rows, cross, own_rows
+from jaxgrasp.robustness.auditing.parts import cross, inner, once, parts_of, rows_of
+from jaxgrasp.robustness.auditing.problem import Hand, Problem, problem_of
+from jaxgrasp.robustness.auditing.rows import Range, Rows, own_rows
 from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.robustness.interface.solution import Solution
 from jaxgrasp.solvers.status import Status
@@ -166,52 +169,64 @@ def rows_size(rows: Rows) -> jax.Array:
 def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array, jax.Array]:
     """Whether G f_0 = b, and the margin that f_0 attains, -inf where a row fails that nothing disturbs; (lanes,)."""
     forces, missed = solution.forces, MISSED[solution.forces.dtype.name]
-    there = problem.present
-    cone, bound = row_values(problem, forces, rows.cone.shape[-1])
-    slack = missed * problem.max_force
-    spare = (slack - problem.reserve[:, None])[:, :, None] - cone
-    parts = [_most(jnp.where(there[:, :, None], spare, jnp.inf), rows.cone)]
-    parts += [_most(jnp.where(there, problem.max_force + slack - bound, jnp.inf), rows.bound)]
-    holds = balanced(problem, forces)
+
+    @once
+    def attained(problem: Problem, forces: jax.Array, rows: Rows) -> jax.Array:
+        """By every contact, (lanes, n)."""
+        slack = missed * problem.max_force
+        cone, bound = row_values(problem, forces, rows.cone.shape[-1])
+        spare = slack - problem.reserve[:, None]
+        parts = [_most(spare - row, rows.cone[..., k]) for k, row in enumerate(cone)]
+        parts += [_most(problem.max_force + slack - bound, rows.bound)]
+        return jnp.where(problem.present, fold(jnp.minimum, parts), jnp.inf)
+
+    most, holds = _min(attained(problem, forces, rows)), balanced(problem, forces)
     if problem.hand is not None:
         efforts, slack = solution.actuator_efforts, missed * effort_unit(problem.hand)
         assert efforts is not None and rows.effort is not None
         spare = jnp.stack([problem.hand.upper + slack - efforts, efforts - problem.hand.lower + slack], 1)
-        parts += [_most(spare, rows.effort)]
+        most = jnp.minimum(most, _min(_most(spare, rows.effort), 2))
         holds &= _driven(problem.hand, forces, efforts)
-    return holds, fold(jnp.minimum, parts)
+    return holds, most
 
 
 def _most(spare: jax.Array, loss: jax.Array) -> jax.Array:
-    """The largest lambda with lambda loss <= spare in every row, (lanes,)."""
+    """The largest lambda with lambda loss <= spare, of every row."""
     moved = loss > 0
     still = jnp.where(spare >= 0, jnp.inf, -jnp.inf)
-    return _min(jnp.where(moved, spare / jnp.where(moved, loss, 1), still), loss.ndim - 1)
+    return jnp.where(moved, spare / jnp.where(moved, loss, 1), still)
 
 
-def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[jax.Array, jax.Array]:
-    """C f (lanes, n, n_e) and -f_n (lanes, n)."""
-    pressed = jnp.stack([forces[..., 0], forces[..., 1], problem.friction * forces[..., 2]], -1)
-    pattern = facets(cone_edges, forces.dtype)
-    cone = fold(jnp.add, [pressed[..., a, None] * pattern[:, a] for a in range(3)])
-    return cone, -forces[..., 2]
+def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[list[jax.Array], jax.Array]:
+    """C f of every facet, and -f_n, (lanes, n) each."""
+    pressed = forces[..., 0], forces[..., 1], problem.friction * forces[..., 2]
+    return [_weighed(facet, pressed) for facet in pyramid_facets(cone_edges)], -forces[..., 2]
 
 
 def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = None) -> jax.Array:
     """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size; (lanes,)."""
-    f, frames = forces, problem.frames
-    pushes = frames[..., 0] * f[..., :1] + frames[..., 1] * f[..., 1:2] + frames[..., 2] * f[..., 2:]
-    size = problem.size[:, None]
-    wanted = problem.wrench if wrench is None else wrench
-    moments = fold(jnp.add, jnp.moveaxis(cross(problem.positions, pushes, -1), 1, 0))
-    missing = jnp.concatenate(
-        [fold(jnp.add, jnp.moveaxis(pushes, 1, 0)) - wanted[:, :3], (moments - wanted[:, 3:]) / size], -1
-    )
-    largest = jnp.maximum(_max(jnp.abs(wanted[:, :3])), _max(jnp.abs(wanted[:, 3:] / size)))
+
+    @once
+    def applied(problem: Problem, forces: jax.Array) -> list[jax.Array]:
+        """Forces in the object's frame, moments, and |f|; (lanes, n) each."""
+        f = parts_of(forces)
+        pushes = [inner(row, f) for row in rows_of(problem.frames)]
+        return [*pushes, *cross(parts_of(problem.positions), pushes), jnp.sqrt(inner(f, f))]
+
+    *given, sizes = (_sum(part) for part in applied(problem, forces))
+    wanted, size = parts_of(problem.wrench if wrench is None else wrench), problem.size
+    wanted = wanted[:3] + [moment / size for moment in wanted[3:]]
+    given = given[:3] + [moment / size for moment in given[3:]]
+    missing = fold(jnp.maximum, [jnp.abs(have - want) for have, want in zip(given, wanted, strict=True)])
     # Forces that are nothing but rounding are none.
-    largest = jnp.maximum(largest, _sum(jnp.sqrt(_sum(f * f))))
-    largest = jnp.maximum(largest, _NOTHING[f.dtype.name] * _max(jnp.where(problem.present, problem.max_force, 0)))
-    return _max(jnp.abs(missing)) <= MISSED[f.dtype.name] * largest
+    largest = jnp.maximum(fold(jnp.maximum, [jnp.abs(want) for want in wanted]), sizes)
+    largest = jnp.maximum(largest, _NOTHING[forces.dtype.name] * _max(jnp.where(problem.present, problem.max_force, 0)))
+    return missing <= MISSED[forces.dtype.name] * largest
+
+
+def _weighed(weights: Sequence[float], parts: Sequence[jax.Array]) -> jax.Array:
+    """A sum with numbers for weights."""
+    return fold(jnp.add, [float(weight) * part for weight, part in zip(weights, parts, strict=True)])
 
 
 def effort_unit(hand: Hand) -> jax.Array:
@@ -229,39 +244,58 @@ def _driven(hand: Hand, forces: jax.Array, efforts: jax.Array) -> jax.Array:
     return jnp.abs(given - taken).max(-1) <= MISSED[forces.dtype.name] * largest
 
 
-def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A'z + G'y, (lanes, n, 3), and the sum of the cone rows' multipliers of every contact, (lanes, n)."""
-    patterns = facets(cone.shape[-1], cone.dtype)
-    patterns = jnp.concatenate([patterns, jnp.ones_like(patterns[:, :1])], 1)
-    pull = fold(jnp.add, [cone[..., k, None] * patterns[k] for k in range(cone.shape[-1])])
-    turned = y[:, None, :3] + cross(jnp.broadcast_to(y[:, None, 3:], problem.positions.shape), problem.positions, -1)
-    frames = problem.frames
-    along = frames[:, :, 0] * turned[..., :1] + frames[:, :, 1] * turned[..., 1:2] + frames[:, :, 2] * turned[..., 2:]
-    normal = pull[..., 2] * problem.friction - bound
-    return jnp.stack([pull[..., 0], pull[..., 1], normal], -1) + along, pull[..., 3]
+def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> list[jax.Array]:
+    """A'z + G'y by components, (lanes, n) each."""
+    z = parts_of(cone)
+    first, second, normal = (_weighed(weights, z) for weights in pyramid_facets(len(z)).T)
+    y = [part[:, None] for part in parts_of(y)]
+    turned = [y[a] + moment for a, moment in enumerate(cross(y[3:], parts_of(problem.positions)))]
+    along = [inner(column, turned) for column in zip(*rows_of(problem.frames), strict=True)]
+    return [first + along[0], second + along[1], normal * problem.friction - bound + along[2]]
 
 
-def _lost(problem: Problem, residual: jax.Array) -> jax.Array:
+def _lost(problem: Problem, residual: Sequence[jax.Array]) -> jax.Array:
     """The most that r'f can be for the admissible forces of every contact, (lanes, n)."""
-    residual = jnp.abs(residual)
-    tangential = (residual[..., 0] + residual[..., 1]) * problem.friction
-    return (tangential + residual[..., 2]) * problem.max_force
+    first, second, normal = (jnp.abs(part) for part in residual)
+    return ((first + second) * problem.friction + normal) * problem.max_force
+
+
+def _held(problem: Problem, cone: jax.Array, bound: jax.Array) -> jax.Array:
+    """The contacts' part of h'z, (lanes, n)."""
+    return bound * problem.max_force - fold(jnp.add, parts_of(cone)) * problem.reserve[:, None]
+
+
+@once
+def _pull(cone: jax.Array, bound: jax.Array, rows: Rows) -> jax.Array:
+    """The contacts' part of z'sigma, (lanes, n)."""
+    return fold(jnp.add, [z * s for z, s in zip(parts_of(cone), parts_of(rows.cone), strict=True)]) + bound * rows.bound
+
+
+@once
+def _least_multiplier(cone: jax.Array, bound: jax.Array) -> jax.Array:
+    """Of the rows of every contact, (lanes, n)."""
+    return jnp.minimum(fold(jnp.minimum, parts_of(cone)), bound)
 
 
 def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.Array, jax.Array]:
     """The bound that the multipliers prove, inf where none, and whether they prove that b cannot be borne; (lanes,)."""
     cone, bound, y = evidence.cone_multipliers, evidence.bound_multipliers, evidence.wrench_multipliers
-    residual, total = _pulled(problem, cone, bound, y)
-    pull = _sum(cone * rows.cone, 2) + _sum(bound * rows.bound)
-    sound = (_min(cone, 2) >= 0) & (_min(bound) >= 0)
-    value, more = _sum(problem.wrench * y), 0.0
+
+    @once
+    def costs(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array, more: jax.Array | None) -> jax.Array:
+        """The part of h'z - r'f of every contact at the most, (lanes, n)."""
+        residual = _added(_pulled(problem, cone, bound, y), more)
+        return jnp.where(problem.present, _held(problem, cone, bound) + _lost(problem, residual), 0)
+
+    pull = _sum(_pull(cone, bound, rows))
+    sound = _min(_least_multiplier(cone, bound)) >= 0
+    value, more = _sum(problem.wrench * y), None
     if problem.hand is not None:
         more, held, spent = _of_efforts(problem.hand, evidence, rows)
         pull, value = pull + held[0], value + held[1] + spent
         assert evidence.actuator_multipliers is not None
         sound &= _min(evidence.actuator_multipliers, 2) >= 0
-    each = bound * problem.max_force - total * problem.reserve[:, None] + _lost(problem, residual + more)
-    value = value + _sum(jnp.where(problem.present, each, 0))
+    value = value + _sum(costs(problem, cone, bound, y, more))
     bound = jnp.where(sound & (pull > 0), value / jnp.where(pull > 0, pull, 1), jnp.inf)
     return bound, sound & (value < 0)
 
@@ -309,36 +343,53 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
 
     1/2 f'Q_0 f >= min (1/2 f'Q_0 f + r'f) - h'z - b'y with r = A'z + G'y, for all admissible f.
     """
-    dtype, there, forces, asked = solution.forces.dtype.name, problem.present, solution.forces, problem.margin
+    dtype, there, asked = solution.forces.dtype.name, problem.present, problem.margin
     cone, bound, y = solution.cone_multipliers, solution.bound_multipliers, solution.wrench_multipliers
-    sound = (_min(cone, 2) >= 0) & (_min(bound) >= 0)
-    residual, total = _pulled(problem, cone, bound, y)
-    held = bound * problem.max_force - total * problem.reserve[:, None]
-    held = _sum(jnp.where(there, held, 0)) + _sum(problem.wrench * y)
-    assert asked is not None
-    held -= asked * (_sum(cone * rows.cone, 2) + _sum(bound * rows.bound))
+    pull, value, spent, more = _sum(_pull(cone, bound, rows)), 0.0, 0.0, None
+    sound = _min(_least_multiplier(cone, bound)) >= 0
     if problem.hand is not None:
-        more, (pull, value), spent = _of_efforts(problem.hand, solution, rows)
-        residual, held = residual + more, held + value + spent - pull * asked
+        more, (moved, value), spent = _of_efforts(problem.hand, solution, rows)
+        pull = pull + moved
         assert solution.actuator_multipliers is not None
         sound &= _min(solution.actuator_multipliers, 2) >= 0
-    if problem.weights is None:
-        largest, weighed, answered = 1.0, forces, residual
-    else:
-        weights = jnp.where(there[:, :, None, None], problem.weights, jnp.eye(3, dtype=forces.dtype))
-        largest = _max(jnp.abs(weights), 2)
-        weighed, answered = jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
-    own = 0.5 * _sum(forces * weighed)
-    # Of every contact the better of two bounds: without its limits, and by the tangent at f_0 within them.
-    least = jnp.maximum(-0.5 * _sum(residual * answered), -own - _lost(problem, weighed + residual))
-    effort, lower = (_sum(jnp.where(there, part, 0)) for part in (own, least))
+
+    @once
+    def bounds(problem: Problem, solution: Solution, more: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+        """The effort of every contact, and the least that it and its part of r'f - h'z can be, (lanes, n)."""
+        cone, bound = solution.cone_multipliers, solution.bound_multipliers
+        residual = _added(_pulled(problem, cone, bound, solution.wrench_multipliers), more)
+        forces = parts_of(solution.forces)
+        weighed, answered = forces, residual
+        if problem.weights is not None:
+            eye = jnp.eye(3, dtype=solution.forces.dtype)
+            weights = rows_of(jnp.where(problem.present[:, :, None, None], problem.weights, eye))
+            weighed, answered = [inner(row, forces) for row in weights], _divided(residual, weights)
+        own = 0.5 * inner(forces, weighed)
+        # The better of two bounds: without the contact's limits, and by the tangent at f_0 within them.
+        tangent = [w + r for w, r in zip(weighed, residual, strict=True)]
+        least = jnp.maximum(-0.5 * inner(residual, answered), -own - _lost(problem, tangent))
+        none = jnp.zeros_like(own)
+        there = problem.present
+        return jnp.where(there, own, none), jnp.where(there, least - _held(problem, cone, bound), none)
+
+    effort, lower = (_sum(part) for part in bounds(problem, solution, more))
+    assert asked is not None
+    lower = lower - _sum(problem.wrench * y) - value - spent + asked * pull
+    largest = 1.0 if problem.weights is None else _max(jnp.abs(problem.weights), 2)
     unit = _max(jnp.where(there, largest * problem.max_force**2, 0))
     near = CLOSED[dtype] * jnp.maximum(effort, 1e-3 * unit)
-    return sound & (effort - (lower - held) <= near) & (jnp.abs(effort - solution.effort) <= near)
+    return sound & (effort - lower <= near) & (jnp.abs(effort - solution.effort) <= near)
 
 
-def _divided(vectors: jax.Array, matrices: jax.Array) -> jax.Array:
-    """Q^-1 v for blocks (..., 3, 3), by their adjugates."""
-    a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
-    adjugate = jnp.stack([cross(b, c, -1), cross(c, a, -1), cross(a, b, -1)], -1)
-    return jnp.einsum("...ab,...b->...a", adjugate, vectors) / (a * adjugate[..., 0]).sum(-1)[..., None]
+def _added(vectors: list[jax.Array], more: jax.Array | None) -> list[jax.Array]:
+    """Vectors by components and others (lanes, n, 3), if there are any."""
+    return vectors if more is None else [a + b for a, b in zip(vectors, parts_of(more), strict=True)]
+
+
+def _divided(vectors: Sequence[jax.Array], matrices: list[list[jax.Array]]) -> list[jax.Array]:
+    """Q^-1 v by components, by the adjugate."""
+    a, b, c = matrices
+    # The columns of the adjugate.
+    columns = cross(b, c), cross(c, a), cross(a, b)
+    determinant = inner(a, columns[0])
+    return [inner(row, vectors) / determinant for row in zip(*columns, strict=True)]

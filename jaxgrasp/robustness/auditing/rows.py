@@ -20,6 +20,7 @@ from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.fence import fenced, fences
+from jaxgrasp.robustness.auditing.parts import cross
 from jaxgrasp.robustness.auditing.problem import Problem, facets
 
 # Shares of the longest row between which a row may count as independent or not: there the solver's word is taken.
@@ -95,21 +96,14 @@ def own_inverse(problem: Problem) -> jax.Array:
 
 def _stacked_rows(problem: Problem) -> jax.Array:
     """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, 3 n, lanes)."""
-    arms = jnp.broadcast_to(problem.positions[:, :, :, None], problem.frames.shape)
-    blocks = jnp.concatenate([problem.frames, cross(arms, problem.frames, 2) / problem.size[:, None, None, None]], 2)
-    rows = jnp.moveaxis(blocks, (2, 1, 3, 0), (0, 1, 2, 3)).reshape(6, -1, blocks.shape[0])
+    frames = jnp.moveaxis(problem.frames, (2, 1, 3, 0), (0, 1, 2, 3))
+    arms = jnp.moveaxis(problem.positions, (2, 1, 0), (0, 1, 2))[:, :, None]
+    rows = jnp.concatenate([frames, jnp.stack(cross(arms, frames)) / problem.size]).reshape(6, -1, frames.shape[-1])
     hand = problem.hand
     if hand is None or hand.unreached is None:
         return rows
     bare = jnp.einsum("lrv,liav->rial", *_alike(hand.unreached, hand.jacobian)) / problem.size
     return jnp.concatenate([rows, bare.reshape(bare.shape[0], -1, bare.shape[-1])])
-
-
-def cross(a: jax.Array, b: jax.Array, axis: int) -> jax.Array:
-    """The cross product, spelt out: it then becomes part of what is around it."""
-    a, b = jnp.moveaxis(a, axis, 0), jnp.moveaxis(b, axis, 0)
-    product = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    return jnp.stack(product, axis)
 
 
 def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
