@@ -1,6 +1,5 @@
 """The data of the grasps as the audit sees them: the public arguments, lanes leading, in newtons and metres."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -18,7 +17,8 @@ from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
 class Problem(NamedTuple):
     """Grasps and what is asked of them; leaves (lanes, ...), or (1, ...) where all lanes share them.
 
-    positions, frames, friction, max_force: as in `Contacts`; zero where a contact is absent, but for max_force, 1.
+    positions, frames: as in `Contacts`; whatever is given where a contact is absent.
+    friction, max_force: as in `Contacts`; 0 and 1 where a contact is absent.
     present: bool (lanes, n).
     size: (lanes,), m, root-mean-square distance of the contacts from the centre of mass; 1 where that is zero.
     wrench: (lanes, 6), b, N and N m.
@@ -66,11 +66,8 @@ def problem_of(arguments: Arguments) -> Problem:
     assert data.required_wrench is not None
     present = contacts.active
     here = lambda x, other: jnp.where(present.reshape(*present.shape, *[1] * (x.ndim - 2)), x, other)
-    positions, friction, max_force = (
-        here(contacts.positions, 0),
-        here(contacts.friction, 0),
-        here(contacts.max_force, 1),
-    )
+    positions = here(contacts.positions, 0)
+    friction, max_force = here(contacts.friction, 0), here(contacts.max_force, 1)
     count = jnp.maximum(fold_last(jnp.add, present.astype(positions.dtype)), 1)
     # In units of the largest, whose square may be more, or less, than there are numbers for.
     largest = fold_last(jnp.maximum, jnp.abs(positions), 2)
@@ -78,8 +75,8 @@ def problem_of(arguments: Arguments) -> Problem:
     square = fold_last(jnp.add, (positions / largest[:, None, None]) ** 2, 2) / count
     strongest = jnp.where(present, max_force, 0)
     return Problem(
-        positions=positions,
-        frames=here(contacts.frames, 0),
+        positions=contacts.positions,
+        frames=contacts.frames,
         friction=friction,
         max_force=max_force,
         present=present,
@@ -121,12 +118,6 @@ def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_fo
         lower=jnp.moveaxis(limits.lower, -1, 0),
         upper=jnp.moveaxis(limits.upper, -1, 0),
     )
-
-
-def picked(arguments: Arguments, turn: jax.Array, stride: int) -> Arguments:
-    """The arguments of one lane in `stride`, see `every`."""
-    pick = lambda x, shared: x if shared else every(x, turn, stride)
-    return replace(arguments, inputs=jax.tree.map(pick, arguments.inputs, arguments.shared))
 
 
 def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:

@@ -207,13 +207,19 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
     """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size; (lanes,)."""
 
     @once
-    def applied(problem: Problem, forces: jax.Array) -> list[jax.Array]:
-        """Forces in the object's frame, moments, and |f|; (lanes, n) each."""
+    def pushes(problem: Problem, forces: jax.Array) -> list[jax.Array]:
+        """Forces in the object's frame, and their sizes; (lanes, n) each."""
         f = parts_of(forces)
-        pushes = [inner(row, f) for row in rows_of(problem.frames)]
-        return [*pushes, *cross(parts_of(problem.positions), pushes), jnp.sqrt(inner(f, f))]
+        turned = [inner(row, f) for row in rows_of(problem.frames)]
+        return [*(jnp.where(problem.present, part, 0) for part in turned), jnp.sqrt(inner(f, f))]
 
-    *given, sizes = (_sum(part) for part in applied(problem, forces))
+    @once
+    def moments(problem: Problem, pushes: list[jax.Array]) -> list[jax.Array]:
+        parts = cross(parts_of(problem.positions), pushes)
+        return [jnp.where(problem.present, part, 0) for part in parts]
+
+    *applied, sizes = pushes(problem, forces)
+    given, sizes = [_sum(part) for part in applied + moments(problem, applied)], _sum(sizes)
     wanted, size = parts_of(problem.wrench if wrench is None else wrench), problem.size
     wanted = wanted[:3] + [moment / size for moment in wanted[3:]]
     given = given[:3] + [moment / size for moment in given[3:]]
@@ -267,14 +273,10 @@ def _held(problem: Problem, cone: jax.Array, bound: jax.Array) -> jax.Array:
 
 @once
 def _pull(cone: jax.Array, bound: jax.Array, rows: Rows) -> jax.Array:
-    """The contacts' part of z'sigma, (lanes, n)."""
-    return fold(jnp.add, [z * s for z, s in zip(parts_of(cone), parts_of(rows.cone), strict=True)]) + bound * rows.bound
-
-
-@once
-def _least_multiplier(cone: jax.Array, bound: jax.Array) -> jax.Array:
-    """Of the rows of every contact, (lanes, n)."""
-    return jnp.minimum(fold(jnp.minimum, parts_of(cone)), bound)
+    """The contacts' part of z'sigma, (lanes, n); -inf where a multiplier is negative and proves nothing."""
+    z = [*parts_of(cone), bound]
+    pull = inner(z, [*parts_of(rows.cone), rows.bound])
+    return jnp.where(fold(jnp.minimum, z) >= 0, pull, -jnp.inf)
 
 
 def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.Array, jax.Array]:
@@ -287,9 +289,8 @@ def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.
         residual = _added(_pulled(problem, cone, bound, y), more)
         return jnp.where(problem.present, _held(problem, cone, bound) + _lost(problem, residual), 0)
 
-    pull = _sum(_pull(cone, bound, rows))
-    sound = _min(_least_multiplier(cone, bound)) >= 0
-    value, more = _sum(problem.wrench * y), None
+    pull, value, more = _sum(_pull(cone, bound, rows)), _sum(problem.wrench * y), None
+    sound = pull > -jnp.inf
     if problem.hand is not None:
         more, held, spent = _of_efforts(problem.hand, evidence, rows)
         pull, value = pull + held[0], value + held[1] + spent
@@ -346,7 +347,7 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     dtype, there, asked = solution.forces.dtype.name, problem.present, problem.margin
     cone, bound, y = solution.cone_multipliers, solution.bound_multipliers, solution.wrench_multipliers
     pull, value, spent, more = _sum(_pull(cone, bound, rows)), 0.0, 0.0, None
-    sound = _min(_least_multiplier(cone, bound)) >= 0
+    sound = pull > -jnp.inf
     if problem.hand is not None:
         more, (moved, value), spent = _of_efforts(problem.hand, solution, rows)
         pull = pull + moved

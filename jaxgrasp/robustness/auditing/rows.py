@@ -98,7 +98,8 @@ def _stacked_rows(problem: Problem) -> jax.Array:
     """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, 3 n, lanes)."""
     frames = jnp.moveaxis(problem.frames, (2, 1, 3, 0), (0, 1, 2, 3))
     arms = jnp.moveaxis(problem.positions, (2, 1, 0), (0, 1, 2))[:, :, None]
-    rows = jnp.concatenate([frames, jnp.stack(cross(arms, frames)) / problem.size]).reshape(6, -1, frames.shape[-1])
+    blocks = jnp.concatenate([frames, jnp.stack(cross(arms, frames)) / problem.size])
+    rows = jnp.where(problem.present.T[:, None], blocks, 0).reshape(6, -1, blocks.shape[-1])
     hand = problem.hand
     if hand is None or hand.unreached is None:
         return rows
