@@ -19,8 +19,8 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import wrenches_of
-from jaxgrasp.lanes.fence import fenced, fences
-from jaxgrasp.robustness.auditing.parts import cross
+from jaxgrasp.lanes.fence import fences
+from jaxgrasp.robustness.auditing.parts import cross, once
 from jaxgrasp.robustness.auditing.problem import Problem, facets
 
 # Shares of the longest row between which a row may count as independent or not: there the solver's word is taken.
@@ -68,13 +68,13 @@ def own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, 
 
 
 def _own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, Range]:
-    rows = fenced(_stacked_rows)(problem)
+    rows = once(_stacked_rows)(problem)
     # Where rows of the joints stand below those of G the solver does not tell their rank.
     told = rank if rows.shape[0] == 6 else None
     plain = echelon(rows, told)
     if problem.per_vertex is None:
         inverse = _weighted(rows, problem, problem.compliance, told, plain)
-        found = fenced(lambda problem, inverse: _reached(problem, inverse, cone_edges))(problem, inverse)
+        found = once(lambda problem, inverse: _reached(problem, inverse, cone_edges))(problem, inverse)
     else:
 
         def answered(vertex: tuple) -> Rows:
@@ -84,7 +84,7 @@ def _own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows,
 
         vertices = (jnp.moveaxis(problem.per_vertex, 1, 0), wrenches_of(problem.terms))
         found = jax.tree.map(lambda x: jnp.maximum(x.max(0), 0), lax.map(answered, vertices))
-    return found, fenced(_range)(problem, plain)
+    return found, once(_range)(problem, plain)
 
 
 def own_inverse(problem: Problem) -> jax.Array:
@@ -124,31 +124,36 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
     # The rows and, beside them, the row operations that led to them; a row that is done is a unit vector, or zero.
     rows = jnp.concatenate([rows, none + jnp.eye(count, dtype=dtype)[:, :, None]], 1)
 
-    @fenced
+    @once
     def chosen(rows: jax.Array, left: jax.Array, squares: jax.Array) -> tuple:
-        pivot = jnp.argmax(jnp.where(left, squares, -1), 0) == jnp.arange(count)[:, None]
+        squares = jnp.where(left, squares, -1)
+        longest = squares == fold(jnp.maximum, squares)
+        earlier = [longest[0] & False]
+        for row in longest[:-1]:
+            earlier.append(earlier[-1] | row)
+        pivot = longest & ~jnp.stack(earlier)
         return pivot, fold(jnp.add, jnp.where(pivot[:, None], rows, 0))
 
-    @fenced
+    @once
     def remainder(rows: jax.Array, row: jax.Array, shares: jax.Array) -> jax.Array:
         return row - fold(jnp.add, shares[:, None] * rows)
 
-    @fenced
+    @once
     def scaled(row: jax.Array, length: jax.Array, kept: jax.Array) -> jax.Array:
         inverse = jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)
         return jnp.concatenate([row[:width] * inverse, row[width:] * jnp.where(kept, inverse, 1)])
 
-    @fenced
+    @once
     def without(rows: jax.Array, unit: jax.Array, shares: jax.Array, pivot: jax.Array) -> jax.Array:
         return jnp.where(pivot[:, None], unit, rows - shares[:, None] * unit)
 
-    products = fenced(lambda rows, row: _products(rows[:, :width], row[..., :width, :]))
+    products = once(lambda rows, row: _products(rows[:, :width], row[..., :width, :]))
 
     def step(j: jax.Array, state: tuple) -> tuple:
         rows, left, done, stands = state
         pivot, row = chosen(rows, left, products(rows, rows))
         row = remainder(rows, row, jnp.where(left, 0, products(rows, row)))
-        length = fenced(lambda row: jnp.sqrt(fold(jnp.add, row[:width] ** 2)))(row)
+        length = once(lambda row: jnp.sqrt(fold(jnp.add, row[:width] ** 2)))(row)
         kept = length > RANK_TOLERANCE[dtype.name] * longest if rank is None else j < rank
         stands &= jnp.where(kept, length > least, length <= most)
         unit = scaled(row, length, kept)
@@ -158,7 +163,7 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
 
     rows, _, kept, stands = lax.fori_loop(0, count, step, (rows, left, ~left, stands))
     units, operations = rows[:, :width], rows[:, width:]
-    inverse = fenced(lambda a, b: fold(jnp.add, a[:, :, None] * b[:, None]))(units, operations)
+    inverse = once(lambda a, b: fold(jnp.add, a[:, :, None] * b[:, None]))(units, operations)
     return Echelon(inverse, jnp.where(kept[:, None], 0, operations), stands | (rank is None))
 
 
