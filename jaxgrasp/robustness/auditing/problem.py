@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold_last
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
-from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.robustness.actuators import Actuated, clip_limits
 from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
@@ -124,8 +123,3 @@ def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:
     """Lane `turn` of every `stride` lanes; what is left over at the end is not looked at."""
     blocks = x[: x.shape[0] // stride * stride].reshape(-1, stride, *x.shape[1:])
     return jax.lax.dynamic_index_in_dim(blocks, turn, 1, keepdims=False)
-
-
-def facets(cone_edges: int, dtype: jnp.dtype) -> jax.Array:
-    """The facet rows (n_e, 3) for unit friction."""
-    return jnp.asarray(pyramid_facets(cone_edges), dtype)

@@ -207,19 +207,19 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
     """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size; (lanes,)."""
 
     @once
-    def pushes(problem: Problem, forces: jax.Array) -> list[jax.Array]:
-        """Forces in the object's frame, and their sizes; (lanes, n) each."""
+    def turned(problem: Problem, forces: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Forces in the object's frame, (lanes, n, 3), and their sizes, (lanes, n)."""
+        columns = [problem.frames[..., k] * forces[..., k : k + 1] for k in range(3)]
         f = parts_of(forces)
-        turned = [inner(row, f) for row in rows_of(problem.frames)]
-        return [*(jnp.where(problem.present, part, 0) for part in turned), jnp.sqrt(inner(f, f))]
+        return jnp.where(problem.present[..., None], fold(jnp.add, columns), 0), jnp.sqrt(inner(f, f))
 
     @once
-    def moments(problem: Problem, pushes: list[jax.Array]) -> list[jax.Array]:
-        parts = cross(parts_of(problem.positions), pushes)
-        return [jnp.where(problem.present, part, 0) for part in parts]
+    def moments(problem: Problem, pushes: jax.Array) -> list[jax.Array]:
+        return [jnp.where(problem.present, x, 0) for x in cross(parts_of(problem.positions), parts_of(pushes))]
 
-    *applied, sizes = pushes(problem, forces)
-    given, sizes = [_sum(part) for part in applied + moments(problem, applied)], _sum(sizes)
+    pushes, sizes = turned(problem, forces)
+    given = [_sum(part) for part in parts_of(pushes) + moments(problem, pushes)]
+    sizes = _sum(sizes)
     wanted, size = parts_of(problem.wrench if wrench is None else wrench), problem.size
     wanted = wanted[:3] + [moment / size for moment in wanted[3:]]
     given = given[:3] + [moment / size for moment in given[3:]]

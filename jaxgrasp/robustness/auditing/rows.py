@@ -16,12 +16,13 @@ from jax import lax
 
 from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
+from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.fence import fences
 from jaxgrasp.robustness.auditing.parts import cross, once
-from jaxgrasp.robustness.auditing.problem import Problem, facets
+from jaxgrasp.robustness.auditing.problem import Problem
 
 # Shares of the longest row between which a row may count as independent or not: there the solver's word is taken.
 _DOUBTFUL = {"float64": (1e-13, 1e-6), "float32": (1e-7, 3e-3)}
@@ -143,10 +144,6 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
         inverse = jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)
         return jnp.concatenate([row[:width] * inverse, row[width:] * jnp.where(kept, inverse, 1)])
 
-    @once
-    def without(rows: jax.Array, unit: jax.Array, shares: jax.Array, pivot: jax.Array) -> jax.Array:
-        return jnp.where(pivot[:, None], unit, rows - shares[:, None] * unit)
-
     products = once(lambda rows, row: _products(rows[:, :width], row[..., :width, :]))
 
     def step(j: jax.Array, state: tuple) -> tuple:
@@ -158,8 +155,11 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
         stands &= jnp.where(kept, length > least, length <= most)
         unit = scaled(row, length, kept)
         left &= ~pivot
-        rows = without(rows, unit, jnp.where(left, products(rows, unit), 0), pivot)
-        return rows, left, done | pivot & kept, stands
+        shares = jnp.where(left, products(rows, unit), 0)
+        rows = jnp.where(pivot[:, None], unit, rows - shares[:, None] * unit)
+        # The order of the rows is of no account. XLA would write over what it reads, and that takes twice as long.
+        rows, left, done = (x[::-1] for x in (rows, left, done | pivot & kept))
+        return rows, left, done, stands
 
     rows, _, kept, stands = lax.fori_loop(0, count, step, (rows, left, ~left, stands))
     units, operations = rows[:, :width], rows[:, width:]
@@ -197,24 +197,26 @@ def _reached(problem: Problem, inverse: jax.Array, cone_edges: int, wrench: jax.
     units = _units(problem.size)
     # (6, n, lanes) each: the rows of G* for tangents and normal.
     first, second, normal = jnp.moveaxis(inverse[:, :6].reshape(n, 3, 6, lanes), (1, 2), (0, 1)) * units[:, None]
-    c, s, k = facets(cone_edges, inverse.dtype).T[:, :, None, None]
-    slip = jnp.moveaxis(problem.friction, 0, -1)
-    cone = -(c * first[:, None] + s * second[:, None] + k * (slip * normal)[:, None])
-    parts = [cone.reshape(6, -1, lanes), normal]
+    # The rows of C and, after them, of -E: XLA puts arrays together a number at a time.
+    rows = np.concatenate([pyramid_facets(cone_edges), [[0, 0, -1]]])
+    slip = jnp.stack([problem.friction.T] * cone_edges + [jnp.ones_like(problem.friction.T)])
+    c, s, k = jnp.asarray(rows, inverse.dtype).T[:, :, None, None]
+    parts = [-(c * first[:, None] + s * second[:, None] + k * slip * normal[:, None]).reshape(6, -1, lanes)]
     if problem.hand is not None:
         hand = problem.hand
         torque = jnp.einsum("liav,iacl->lvc", hand.jacobian, inverse[:, :6].reshape(n, 3, 6, lanes))
         effort = jnp.einsum("luv,lvc->cul", *_alike(hand.inverse, torque)) * units[:, None]
         parts += [-effort, effort]
-    directions = jnp.concatenate(parts, 1)
+    directions = jnp.concatenate(parts, 1) if len(parts) > 1 else parts[0]
     if wrench is None:
         reach = support(problem.terms, directions)
     else:
         reach = (directions * wrench[:, None]).sum(0)
-    cone, bound, *efforts = jnp.split(reach, np.cumsum([part.shape[1] for part in parts])[:-1])
+    reach, *efforts = jnp.split(reach, np.cumsum([part.shape[1] for part in parts])[:-1])
+    reach = jnp.where(problem.present[:, :, None], jnp.moveaxis(reach.reshape(-1, n, lanes), (0, 2), (2, 0)), 0)
     return Rows(
-        cone=jnp.where(problem.present[:, :, None], jnp.moveaxis(cone.reshape(-1, n, lanes), (0, 2), (2, 0)), 0),
-        bound=jnp.where(problem.present, bound.T, 0),
+        cone=reach[..., :-1],
+        bound=reach[..., -1],
         effort=jnp.moveaxis(jnp.stack(efforts), -1, 0) if efforts else None,
     )
 
