@@ -254,8 +254,8 @@ def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -
     """A'z + G'y by components, (lanes, n) each."""
     z = parts_of(cone)
     first, second, normal = (_weighed(weights, z) for weights in pyramid_facets(len(z)).T)
-    y = [part[:, None] for part in parts_of(y)]
-    turned = [y[a] + moment for a, moment in enumerate(cross(y[3:], parts_of(problem.positions)))]
+    given = [part[:, None] for part in parts_of(y)]
+    turned = [given[a] + moment for a, moment in enumerate(cross(given[3:], parts_of(problem.positions)))]
     along = [inner(column, turned) for column in zip(*rows_of(problem.frames), strict=True)]
     return [first + along[0], second + along[1], normal * problem.friction - bound + along[2]]
 

@@ -99,7 +99,7 @@ def _stacked_rows(problem: Problem) -> jax.Array:
     """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, 3 n, lanes)."""
     frames = jnp.moveaxis(problem.frames, (2, 1, 3, 0), (0, 1, 2, 3))
     arms = jnp.moveaxis(problem.positions, (2, 1, 0), (0, 1, 2))[:, :, None]
-    blocks = jnp.concatenate([frames, jnp.stack(cross(arms, frames)) / problem.size])
+    blocks = jnp.concatenate([frames, jnp.stack(cross(list(arms), list(frames))) / problem.size])
     rows = jnp.where(problem.present.T[:, None], blocks, 0).reshape(6, -1, blocks.shape[-1])
     hand = problem.hand
     if hand is None or hand.unreached is None:
@@ -199,7 +199,7 @@ def _reached(problem: Problem, inverse: jax.Array, cone_edges: int, wrench: jax.
     first, second, normal = jnp.moveaxis(inverse[:, :6].reshape(n, 3, 6, lanes), (1, 2), (0, 1)) * units[:, None]
     # The rows of C and, after them, of -E: XLA puts arrays together a number at a time.
     rows = np.concatenate([pyramid_facets(cone_edges), [[0, 0, -1]]])
-    slip = jnp.stack([problem.friction.T] * cone_edges + [jnp.ones_like(problem.friction.T)])
+    slip = jnp.where(jnp.arange(len(rows))[:, None, None] < cone_edges, problem.friction.T, 1)
     c, s, k = jnp.asarray(rows, inverse.dtype).T[:, :, None, None]
     parts = [-(c * first[:, None] + s * second[:, None] + k * slip * normal[:, None]).reshape(6, -1, lanes)]
     if problem.hand is not None:
