@@ -45,7 +45,8 @@ class Grasp:
     compliance: np.ndarray | None = None
     """None for the identity, (n_c, 3, 3) blocks, (3 n_c, 3 n_c), or (n_d, 3 n_c, 3 n_c) with one for each vertex."""
     cone_edges: int = 8
-    cone_margin: float = 0.0
+    cone_margin: float | np.ndarray = 0.0
+    """d, newtons: for all rows, (n_c, 1), or (n_c, n_e)."""
 
     @cached_property
     def row_scale(self) -> np.ndarray:
@@ -55,14 +56,20 @@ class Grasp:
 
     @cached_property
     def grasp_map(self) -> np.ndarray:
-        """Equation (5): G (6, 3 n_c), contact i contributes [R_i; p_i x R_i]."""
-        moments = np.cross(self.positions[:, :, None], self.frames, axis=1)
-        return np.concatenate([self.frames, moments], axis=1).transpose(1, 0, 2).reshape(6, -1)
+        """Equation (5): G (6, 3 n_c), contact i contributes [R_i; p_i x R_i], its normal alone without friction."""
+        frames = self.frames * np.stack([self.friction > 0] * 2 + [self.friction >= 0], axis=-1)[:, None]
+        moments = np.cross(self.positions[:, :, None], frames, axis=1)
+        return np.concatenate([frames, moments], axis=1).transpose(1, 0, 2).reshape(6, -1)
 
     @cached_property
     def cone_matrix(self) -> np.ndarray:
         """C of (1): (n_c n_e, 3 n_c), block diagonal."""
         return scipy.linalg.block_diag(*(facet_rows(mu, self.cone_edges) for mu in self.friction))
+
+    @cached_property
+    def row_margins(self) -> np.ndarray:
+        """d of (1): (n_c n_e,)."""
+        return np.broadcast_to(self.cone_margin, (len(self.positions), self.cone_edges)).reshape(-1)
 
     @cached_property
     def normal_matrix(self) -> np.ndarray:
@@ -84,6 +91,8 @@ class Grasp:
         on_range = self.range_basis.T @ (self.row_scale[:, None] * self.grasp_map)
         targets = self.vertices * self.row_scale @ self.range_basis
         Qs = compliance_matrix(self.compliance, len(self.positions))
+        felt = np.abs(self.grasp_map).max(0) > 0
+        Qs = np.where(felt[:, None] & felt, Qs, np.eye(len(felt)))
         if Qs.ndim == 2:
             changes = least_norm(on_range, Qs, targets)
         else:
@@ -112,7 +121,12 @@ class Answer:
 
 
 def facet_rows(friction: float, edges: int) -> np.ndarray:
-    """Equation (1): (edges, 3) rows of the pyramid whose edges stand at 2 pi k / edges from t1, on Coulomb's cone."""
+    """Equation (1): (edges, 3) rows of the pyramid whose edges stand at 2 pi k / edges from t1, on Coulomb's cone.
+
+    Without friction they say that a finger does not pull.
+    """
+    if friction == 0:
+        return np.tile([0.0, 0.0, np.cos(np.pi / edges)], (edges, 1))
     k = np.arange(edges)
     edge = friction * np.stack([np.cos(2 * np.pi * k / edges), np.sin(2 * np.pi * k / edges)], axis=-1)
     middle = (edge + np.roll(edge, -1, axis=0)) / 2
@@ -161,11 +175,9 @@ def program(grasp: Grasp, every_direction: bool = False) -> Program:
     tangential = np.where(mu > 0, mu, 1.0) * F
     columns = np.stack([tangential, tangential, F], axis=-1).reshape(-1)
     cone_unit = np.repeat(tangential, grasp.cone_edges)
-    # Without friction the pyramid's rows do not say that a finger cannot pull, so rows of +E say it.
-    slippery = grasp.normal_matrix[mu == 0]
-    rows = np.vstack([grasp.cone_matrix, -grasp.normal_matrix, slippery])
-    unit = np.concatenate([cone_unit, F, F[mu == 0]])
-    limit = np.concatenate([np.full(len(cone_unit), -grasp.cone_margin), F, np.zeros(len(slippery))])
+    rows = np.vstack([grasp.cone_matrix, -grasp.normal_matrix])
+    unit = np.concatenate([cone_unit, F])
+    limit = np.concatenate([-grasp.row_margins, F])
     change = -grasp.force_changes @ rows.T
     sigma = change.reshape(-1) if every_direction else change.max(axis=0)
     cases = len(change) if every_direction else 1
@@ -272,7 +284,7 @@ def row_violation(grasp: Grasp, forces: np.ndarray, margin: float) -> float:
     """How far (n_c, 3) forces overstep the rows of (21) at the given margin, as a share of f_max."""
     S_1, S_2 = worst_case(grasp)
     f, F = forces.reshape(-1), grasp.max_force
-    cone = (grasp.cone_matrix @ f - S_1 * margin + grasp.cone_margin) / np.repeat(F, grasp.cone_edges)
+    cone = (grasp.cone_matrix @ f - S_1 * margin + grasp.row_margins) / np.repeat(F, grasp.cone_edges)
     bound = (-(grasp.normal_matrix @ f) + S_2 * margin - F) / F
     balance = (grasp.grasp_map @ f - grasp.required_wrench) * grasp.row_scale / F.max()
     return float(max(cone.max(), bound.max(), np.abs(balance).max()))
@@ -301,12 +313,15 @@ def actuated_rows(
     `actuation` has jacobian (n_c, 3, n_v), transmission (n_v, n_u), lower and upper (n_u,).
     """
     n_c, joints = len(friction), actuation["jacobian"].shape[-1]
-    J, B = actuation["jacobian"].reshape(3 * n_c, joints), actuation["transmission"]
+    # Without friction a contact has its normal force alone.
+    felt = np.stack([friction > 0, friction > 0, friction >= 0], axis=-1).reshape(-1)
+    G, J, B = G * felt, actuation["jacobian"].reshape(3 * n_c, joints) * felt[:, None], actuation["transmission"]
     count = B.shape[1]
     left, values, _ = np.linalg.svd(B)
     unreached = left[:, np.sum(values > RANK_TOLERANCE * values[0]) :]
     stacked = np.vstack([G, unreached.T @ J.T])
-    root = np.linalg.cholesky(compliance_matrix(compliance, n_c))
+    weights = np.where(felt[:, None] & felt, compliance_matrix(compliance, n_c), np.eye(3 * n_c))
+    root = np.linalg.cholesky(weights)
     star = np.linalg.solve(root.T, np.linalg.pinv(np.linalg.solve(root, stacked.T).T, RANK_TOLERANCE))[:, :6]
     force = -wrenches @ star.T
     effort = force @ J @ np.linalg.pinv(B).T

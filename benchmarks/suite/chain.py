@@ -22,7 +22,7 @@ RANK_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Case:
-    """One grasp: (n_c, 3), (n_c, 3, 3), (n_c,), (n_c,), wrenches (n_d, 6), load (6,)."""
+    """One grasp: (n_c, 3), (n_c, 3, 3), (n_c,), (n_c,), wrenches (n_d, 6), load (6,), cone margins (n_c, 1 or n_e)."""
 
     positions: np.ndarray
     frames: np.ndarray
@@ -31,6 +31,7 @@ class Case:
     wrenches: np.ndarray
     load: np.ndarray
     edges: int = 8
+    cone_margins: np.ndarray | float = 0.0
 
     @cached_property
     def units(self) -> np.ndarray:
@@ -40,9 +41,10 @@ class Case:
 
     @cached_property
     def G(self) -> np.ndarray:
-        """(6, 3 n_c) for forces in units of f_max."""
-        moments = np.cross(self.positions[:, :, None], self.frames, axis=1)
-        blocks = np.concatenate([self.frames, moments], 1) * self.max_force[:, None, None]
+        """(6, 3 n_c) for forces in units of f_max; zero for tangents of contacts without friction."""
+        frames = self.frames * np.stack([self.friction > 0] * 2 + [self.friction >= 0], -1)[:, None]
+        moments = np.cross(self.positions[:, :, None], frames, axis=1)
+        blocks = np.concatenate([frames, moments], 1) * self.max_force[:, None, None]
         return self.units[:, None] * blocks.transpose(1, 0, 2).reshape(6, -1)
 
     @cached_property
@@ -94,15 +96,21 @@ class Case:
             facets = np.stack(
                 [np.cos(angles), np.sin(angles), np.full(self.edges, mu * np.cos(np.pi / self.edges))], -1
             )
+            # Without friction the finger does not pull.
+            facets = facets if mu > 0 else np.tile([0, 0, np.cos(np.pi / self.edges)], (self.edges, 1))
             blocks.append(np.vstack([facets, [[0, 0, -1.0]]]))
-        return sp.block_diag(blocks).toarray(), np.tile([0.0] * self.edges + [1.0], len(self.friction))
+        shares = self.cone_margins / self.max_force[:, None]
+        sides = np.hstack([-shares + np.zeros((len(blocks), self.edges)), np.ones((len(blocks), 1))])
+        return sp.block_diag(blocks).toarray(), sides.reshape(-1)
 
     def cones(self, norm_bound: bool) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """(kind, A, h) with h - A f in the cone: kind "q" second-order, "l" non-negative; a contact after the other."""
         n, parts = len(self.friction), []
+        shares = np.broadcast_to(self.cone_margins / self.max_force[:, None], (n, 1))[:, 0]
         for i, mu in enumerate(self.friction):
             e = np.eye(3 * n)[3 * i : 3 * i + 3]
-            parts.append(("q", np.stack([mu * e[2], -e[0], -e[1]]), np.zeros(3)))
+            coulomb = ("q", np.stack([mu * e[2], -e[0], -e[1]]), np.array([-shares[i], 0, 0]))
+            parts.append(coulomb if mu > 0 else ("l", e[2:], -shares[i : i + 1]))
             if norm_bound:
                 parts.append(("q", np.vstack([np.zeros((1, 3 * n)), -e]), np.array([1.0, 0, 0, 0])))
             else:
@@ -278,12 +286,19 @@ class Batch:
     def __getitem__(self, rows) -> Batch:
         return Batch(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
-    def case(self, i: int, edges: int = 8) -> Case:
+    def case(self, i: int, edges: int = 8, cone_margins: np.ndarray | float = 0.0) -> Case:
         """One of them."""
         wrenches = self.wrenches[i]
         wrenches = wrenches[np.any(wrenches != 0, -1)]
         return Case(
-            self.positions[i], self.frames[i], self.friction[i], self.max_force[i], wrenches, self.load[i], edges
+            self.positions[i],
+            self.frames[i],
+            self.friction[i],
+            self.max_force[i],
+            wrenches,
+            self.load[i],
+            edges,
+            cone_margins,
         )
 
 

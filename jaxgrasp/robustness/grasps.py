@@ -39,8 +39,10 @@ class Grasps:
     """(*lanes), bool: all data of the lane are admissible; the others have no contact present."""
     present: jax.Array
     """(n, *lanes), 1 where a contact is there, else 0."""
+    rough: jax.Array
+    """(n, *lanes), 1 where a contact that is there has friction, else 0; see `admit` for those that have none."""
     friction: jax.Array
-    """(n, *lanes)."""
+    """(n, *lanes); 1 where there is none."""
     max_force: jax.Array
     """(n, *lanes), N."""
     length: jax.Array
@@ -48,13 +50,14 @@ class Grasps:
     units: jax.Array
     """(6, *lanes), what turns wrenches in N and N m to newtons: 1 and 1 / length."""
     columns: jax.Array
-    """(6, 3, n, *lanes), the blocks of G; zero where absent."""
+    """(6, 3, n, *lanes), the blocks of G; zero where absent, and for tangents of contacts without friction."""
     lined: jax.Array
     """bool (*lanes), all contacts are on one line, exactly: two of them always are. G has rank 5 at most."""
     wrench: jax.Array
     """(6, *lanes), b, N."""
-    reserve: jax.Array
-    """(*lanes), d, N."""
+    reserve: jax.Array | None
+    """d, N: (*lanes), one value a grasp, (n, *lanes), a contact, or (n_e, n, *lanes), a row; zero where absent. None
+    where there is none."""
     terms: tuple[Term, ...]
     """The disturbance set, moments in N m; leaves may have lanes of size 1."""
     extents: tuple[jax.Array, ...]
@@ -71,9 +74,30 @@ class Grasps:
     """The hand's actuators; None where the fingers can push at will."""
 
     @property
+    def transmits(self) -> jax.Array:
+        """(3, n, *lanes), 1 where a contact transmits force along t1, t2 and n, else 0."""
+        return jnp.stack([self.rough, self.rough, self.present])
+
+    @property
     def rows(self) -> jax.Array:
         """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
         return stack_rows(self.columns, self.actuated)
+
+    @property
+    def reserves_nothing(self) -> jax.Array:
+        """Whether d = 0 in every row, (*lanes)."""
+        if self.reserve is None:
+            return jnp.ones_like(self.valid)
+        zero = self.reserve == 0
+        for _ in range(zero.ndim - self.length.ndim):
+            zero = fold(jnp.logical_and, zero)
+        return zero
+
+    def row_reserves(self, unit: jax.Array, cone_edges: int) -> jax.Array:
+        """Give every row its d in units (n, *lanes), N, of its contact: (n_e, n, *lanes), zero where absent."""
+        assert self.reserve is not None
+        reserve = jnp.where(self.present > 0, self.reserve / unit, 0)
+        return jnp.broadcast_to(reserve, (cone_edges, *self.present.shape))
 
 
 def over_grasps(function: BatchedFunction, data: GraspData, options: Options | None = None) -> Any:
@@ -121,17 +145,26 @@ def admit_all(arguments: Arguments) -> Grasps:
 
 
 def admit(inputs: Inputs) -> Grasps:
-    """Check the data of every lane, lanes trailing, and replace what cannot be used."""
+    """Check the data of every lane, lanes trailing, and replace what cannot be used.
+
+    A contact without friction transmits its normal force alone: its tangents get no columns in G and none in Q and Q_0.
+    Its friction becomes 1: with tangential forces that do nothing, the rows of its pyramid then say that it does not
+    pull, cos(pi / n_e) f_n <= -d, and not 0 <= -d.
+    """
     data, contacts = inputs.data, inputs.data.contacts
     positions, frames, active = contacts.positions, contacts.frames, contacts.active
     load = data.required_wrench
     assert load is not None
     valid = _usable_contacts(contacts)
-    root, vertex_roots, usable = _roots_of_compliance(data.compliance, active)
+    rough = active & (contacts.friction > 0)
+    transmits = jnp.stack([rough, rough, jnp.broadcast_to(active, rough.shape)], 1)
+    root, vertex_roots, usable = _roots_of_compliance(data.compliance, transmits)
     valid &= usable
-    weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, active, valid)
+    weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, transmits, valid)
     valid &= usable
-    valid &= jnp.isfinite(load).all(0) & (data.cone_margin >= 0) & jnp.isfinite(data.cone_margin)
+    valid &= jnp.isfinite(load).all(0)
+    if data.cone_margin is not None:
+        valid &= _usable_reserve(data.cone_margin, active)
     for extent in inputs.extents:
         valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)
     if data.actuation is not None:
@@ -142,19 +175,20 @@ def admit(inputs: Inputs) -> Grasps:
     length, usable = _length(positions, active & valid, load, inputs.extents)
     valid &= usable
     length = jnp.where(valid, length, 1)
-    present = active & valid
+    present, rough = active & valid, rough & valid
     positions = jnp.where(present, jnp.moveaxis(positions, 1, 0), 0)
-    frames = jnp.where(present, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
+    frames = jnp.where(jnp.stack([rough, rough, present]), jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, load, 0)
-    friction, max_force = (jnp.where(present, x, 1) for x in (contacts.friction, contacts.max_force))
+    friction, max_force = jnp.where(rough, contacts.friction, 1), jnp.where(present, contacts.max_force, 1)
     actuated = None
     if data.actuation is not None:
-        actuated = _admit_actuation(data.actuation, present, valid, length)
+        actuated = _admit_actuation(data.actuation, transmits & valid, valid, length)
         actuated = clip_limits(actuated, friction, jnp.where(present, max_force, 0))
     return Grasps(
         valid=valid,
         present=present.astype(positions.dtype),
+        rough=rough.astype(positions.dtype),
         friction=friction,
         max_force=max_force,
         length=length,
@@ -162,7 +196,7 @@ def admit(inputs: Inputs) -> Grasps:
         columns=grasp_columns(positions / length, frames),
         lined=_lined(positions, present),
         wrench=wrench * units,
-        reserve=jnp.where(valid, data.cone_margin, 0),
+        reserve=None if data.cone_margin is None else _admit_reserve(data.cone_margin, present, valid),
         terms=data.disturbances.terms,
         extents=inputs.extents,
         inverse_root=root,
@@ -181,29 +215,45 @@ def _usable_contacts(contacts: Contacts) -> jax.Array:
     return (usable | ~contacts.active).all(0)
 
 
+def _usable_reserve(reserve: jax.Array, active: jax.Array) -> jax.Array:
+    """Whether d is finite and not negative, where contacts are there, (*lanes)."""
+    usable = (reserve >= 0) & jnp.isfinite(reserve)
+    if usable.ndim < active.ndim:
+        return usable
+    usable = fold(jnp.logical_and, jnp.moveaxis(usable, 1, 0)) if usable.ndim > active.ndim else usable
+    return (usable | ~active).all(0)
+
+
+def _admit_reserve(reserve: jax.Array, present: jax.Array, valid: jax.Array) -> jax.Array:
+    """Lay out d as in `Grasps`, from (*lanes), (n, *lanes) or (n, n_e, *lanes)."""
+    if reserve.ndim < present.ndim:
+        return jnp.where(valid, reserve, 0)
+    return jnp.where(present, jnp.moveaxis(reserve, 1, 0) if reserve.ndim > present.ndim else reserve, 0)
+
+
 def _roots_of_compliance(
-    compliance: jax.Array | Compliance | None, active: jax.Array
+    compliance: jax.Array | Compliance | None, transmits: jax.Array
 ) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
     """M with M M' = Q^-1, the same of every vertex of the set, and whether Q is positive definite, (*lanes)."""
-    n = active.shape[0]
+    n = transmits.shape[0]
     if not isinstance(compliance, Compliance):
-        root, usable = inverse_root(_masked(compliance, active), n)
+        root, usable = inverse_root(_masked(compliance, transmits), n)
         return root, None, usable
     # One Q a direction: the directions trail the lanes while the roots are taken.
     last = jnp.moveaxis(compliance.per_vertex, 0, -1)
-    roots, usable = inverse_root(_masked(last, active[..., None]), n)
+    roots, usable = inverse_root(_masked(last, transmits[..., None]), n)
     assert roots is not None
     return None, jnp.moveaxis(roots, -1, 0), usable.all(-1)
 
 
 def _roots_of_weights(
-    weights: jax.Array | None, active: jax.Array, valid: jax.Array
+    weights: jax.Array | None, transmits: jax.Array, valid: jax.Array
 ) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
-    """Q_0 with the identity for absent contacts, R with R'R = Q_0, and whether it is positive definite, (*lanes)."""
-    masked = _masked(weights, active)
+    """Q_0 with the identity for absent forces, R with R'R = Q_0, and whether it is positive definite, (*lanes)."""
+    masked = _masked(weights, transmits)
     if masked is None:
         return None, None, jnp.array(True)
-    usable = inverse_root(masked, active.shape[0])[1]
+    usable = inverse_root(masked, transmits.shape[0])[1]
     definite = jnp.where(valid & usable, masked, jnp.eye(3, dtype=masked.dtype)[..., None])
     roots = linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
     return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
@@ -266,9 +316,9 @@ def _usable_actuation(actuation: Actuation, active: jax.Array) -> jax.Array:
     return usable & ((lower <= upper) & (lower < jnp.inf) & (upper > -jnp.inf)).all(0)
 
 
-def _admit_actuation(actuation: Actuation, present: jax.Array, valid: jax.Array, length: jax.Array) -> Actuated:
+def _admit_actuation(actuation: Actuation, transmits: jax.Array, valid: jax.Array, length: jax.Array) -> Actuated:
     """The actuation in units of the length, harmless in lanes that are not valid."""
-    jacobian = jnp.where(present[:, None, None], actuation.jacobian, 0)
+    jacobian = jnp.where(transmits[:, :, None], actuation.jacobian, 0)
     safe = lambda matrix: jnp.where(valid, matrix, 0)
     return Actuated(
         joints=jnp.moveaxis(jacobian, (2, 1, 0), (0, 1, 2)) / length,
@@ -280,15 +330,20 @@ def _admit_actuation(actuation: Actuation, present: jax.Array, valid: jax.Array,
     )
 
 
-def _masked(matrices: jax.Array | None, active: jax.Array) -> jax.Array | None:
-    """Blocks or full matrices of contacts with the absent ones' rows and columns replaced by the identity's."""
+def _masked(matrices: jax.Array | None, transmits: jax.Array) -> jax.Array | None:
+    """Blocks or full matrices of contacts with the identity's rows and columns for forces that are not transmitted.
+
+    Args:
+        matrices: (n, 3, 3, *lanes) or (3 n, 3 n, *lanes).
+        transmits: bool (n, 3, *lanes).
+    """
     if matrices is None:
         return None
-    full = matrices.shape[:2] == (3 * active.shape[0],) * 2
+    full = matrices.shape[:2] == (3 * transmits.shape[0],) * 2
     eye = jnp.eye(matrices.shape[1], dtype=matrices.dtype).reshape(
-        (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (active.ndim - 1)
+        (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (transmits.ndim - 2)
     )
     if not full:
-        return jnp.where(active[:, None, None], matrices, eye)
-    there = jnp.repeat(active, 3, 0)
+        return jnp.where(transmits[:, :, None] & transmits[:, None], matrices, eye)
+    there = transmits.reshape(-1, *transmits.shape[2:])
     return jnp.where(there[:, None] & there[None], matrices, eye)

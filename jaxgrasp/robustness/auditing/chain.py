@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.auditing.problem import Problem
-from jaxgrasp.robustness.auditing.pyramids import CLOSED, MISSED, balanced, row_values
+from jaxgrasp.robustness.auditing.pyramids import CLOSED, MISSED, balanced, reserves, row_values
 from jaxgrasp.robustness.auditing.rows import own_inverse
 from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, inner
 
@@ -38,11 +38,15 @@ def admissible(problem: Problem, forces: jax.Array, exact: bool, cone_edges: int
     if exact:
         tangent = jnp.sqrt(forces[..., 0] ** 2 + forces[..., 1] ** 2)
         over = tangent + friction * normal
+        over = over if problem.reserve is None else over + problem.reserve[..., 0]
         within = (normal <= slack) & (over <= slack)
         if norm_bound:
             within &= jnp.sqrt((forces * forces).sum(-1)) <= most + slack
     else:
-        within = fold(jnp.logical_and, [row <= slack for row in row_values(problem, forces, cone_edges)[0]])
+        cone = row_values(problem, forces, cone_edges)[0]
+        if problem.reserve is not None:
+            cone = [row + kept for row, kept in zip(cone, reserves(problem, cone_edges), strict=True)]
+        within = fold(jnp.logical_and, [row <= slack for row in cone])
     return ((within & (-normal <= most + slack)) | ~problem.present).all(-1)
 
 

@@ -17,11 +17,13 @@ class Problem(NamedTuple):
     """Grasps and what is asked of them; leaves (lanes, ...), or (1, ...) where all lanes share them.
 
     positions, frames: as in `Contacts`; whatever is given where a contact is absent.
-    friction, max_force: as in `Contacts`; 0 and 1 where a contact is absent.
+    friction, max_force: as in `Contacts`; 0 and 1 where a contact is absent. A contact without friction has friction 1:
+        the rows of C then say that it does not pull.
     present: bool (lanes, n).
+    transmits: bool (lanes, n, 3), which components of force a contact has: without friction the normal one alone.
     size: (lanes,), m, root-mean-square distance of the contacts from the centre of mass; 1 where that is zero.
     wrench: (lanes, 6), b, N and N m.
-    reserve: (lanes,), d, N.
+    reserve: (lanes, n or 1, n_e or 1), d, N, zero where a contact is absent; None where there is none.
     terms: the disturbance set, lanes trailing.
     reach: (lanes, 6), the largest |w_i| of the set.
     compliance, per_vertex, weights, margin, cutoff: as given; None where not.
@@ -33,9 +35,10 @@ class Problem(NamedTuple):
     friction: jax.Array
     max_force: jax.Array
     present: jax.Array
+    transmits: jax.Array
     size: jax.Array
     wrench: jax.Array
-    reserve: jax.Array
+    reserve: jax.Array | None
     terms: tuple[Term, ...]
     reach: jax.Array
     compliance: jax.Array | None
@@ -63,10 +66,11 @@ def problem_of(arguments: Arguments) -> Problem:
     inputs: Inputs = jax.tree.map(leading, arguments.inputs, arguments.shared)
     data, contacts, compliance = inputs.data, inputs.data.contacts, inputs.data.compliance
     assert data.required_wrench is not None
-    present = contacts.active
+    present, rough = contacts.active, contacts.active & (contacts.friction > 0)
+    transmits = jnp.stack([rough, rough, jnp.broadcast_to(present, rough.shape)], -1)
     here = lambda x, other: jnp.where(present.reshape(*present.shape, *[1] * (x.ndim - 2)), x, other)
     positions = here(contacts.positions, 0)
-    friction, max_force = here(contacts.friction, 0), here(contacts.max_force, 1)
+    friction, max_force = here(jnp.where(rough, contacts.friction, 1), 0), here(contacts.max_force, 1)
     count = jnp.maximum(fold_last(jnp.add, present.astype(positions.dtype)), 1)
     # In units of the largest, whose square may be more, or less, than there are numbers for.
     largest = fold_last(jnp.maximum, jnp.abs(positions), 2)
@@ -79,9 +83,10 @@ def problem_of(arguments: Arguments) -> Problem:
         friction=friction,
         max_force=max_force,
         present=present,
+        transmits=transmits,
         size=largest * jnp.sqrt(jnp.where(square > 0, square, 1)),
         wrench=data.required_wrench,
-        reserve=data.cone_margin,
+        reserve=None if data.cone_margin is None else _reserve(data.cone_margin, present),
         terms=jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), data.disturbances.terms),
         reach=sum(inputs.extents),  # pyright: ignore[reportArgumentType]  # no sum of none
         compliance=None if isinstance(compliance, Compliance) else compliance,
@@ -91,8 +96,13 @@ def problem_of(arguments: Arguments) -> Problem:
         cutoff=inputs.options.cutoff,
         hand=None
         if data.actuation is None
-        else _hand(data.actuation, here(data.actuation.jacobian, 0), friction, strongest),
+        else _hand(data.actuation, jnp.where(transmits[..., None], data.actuation.jacobian, 0), friction, strongest),
     )
+
+
+def _reserve(reserve: jax.Array, present: jax.Array) -> jax.Array:
+    rows = reserve.reshape(*reserve.shape, *[1] * (3 - reserve.ndim))
+    return rows if reserve.ndim == 1 else jnp.where(present[:, :, None], rows, 0)
 
 
 def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_force: jax.Array) -> Hand:

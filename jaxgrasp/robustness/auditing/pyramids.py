@@ -94,8 +94,8 @@ def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Ar
     if problem.hand is not None:
         assert rows.effort is not None and used.effort is not None
         right &= (margin * jnp.abs(rows.effort - used.effort).max(1) <= near * effort_unit(problem.hand)).all(-1)
-    # Where the set is said to reach outside, and neither multipliers nor contacts without friction bound the margin.
-    proven = jnp.where(_slips(problem, used), 0, _upper_bound(problem, evidence, used)[0])
+    # Where the set is said to reach outside, and multipliers do not bound the margin.
+    proven = _upper_bound(problem, evidence, used)[0]
     unproven = proven > CLOSED[margin.dtype.name] * natural_scale(problem, used)
     flat = (solution.status == Status.SOLVED) & _claims_flat(solution)
     # Rows of wrenches outside the range mean nothing; where only that makes the margin zero, they have to be outside.
@@ -127,7 +127,7 @@ def _judged(
     status, asked = solution.status, problem.margin
     scale = natural_scale(problem, rows)
     proven, refuted = _upper_bound(problem, evidence, rows)
-    proven = jnp.where(_flat(problem, solution, rows, place), 0, proven)
+    proven = jnp.where(_flat(solution, place), 0, proven)
     holds, attained = _primal(problem, solution, rows)
     slack = CLOSED[dtype] * jnp.maximum(scale, jnp.abs(jnp.where(jnp.isfinite(attained), attained, 0)))
 
@@ -175,8 +175,8 @@ def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array
         """By every contact, (lanes, n)."""
         slack = missed * problem.max_force
         cone, bound = row_values(problem, forces, rows.cone.shape[-1])
-        spare = slack - problem.reserve[:, None]
-        parts = [_most(spare - row, rows.cone[..., k]) for k, row in enumerate(cone)]
+        reserve = reserves(problem, len(cone))
+        parts = [_most(slack - reserve[k] - row, rows.cone[..., k]) for k, row in enumerate(cone)]
         parts += [_most(problem.max_force + slack - bound, rows.bound)]
         return jnp.where(problem.present, fold(jnp.minimum, parts), jnp.inf)
 
@@ -204,30 +204,41 @@ def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[li
 
 
 def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = None) -> jax.Array:
-    """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size; (lanes,)."""
+    """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size, by forces that can be; (lanes,)."""
 
     @once
-    def turned(problem: Problem, forces: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Forces in the object's frame, (lanes, n, 3), and their sizes, (lanes, n)."""
-        columns = [problem.frames[..., k] * forces[..., k : k + 1] for k in range(3)]
+    def turned(problem: Problem, forces: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Forces in the object's frame, (lanes, n, 3), their sizes, and whether contacts can have them, (lanes, n)."""
+        acting = jnp.where(problem.transmits, forces, 0)
+        columns = [problem.frames[..., k] * acting[..., k : k + 1] for k in range(3)]
+        pushes = jnp.where(problem.present[..., None], fold(jnp.add, columns), 0)
         f = parts_of(forces)
-        return jnp.where(problem.present[..., None], fold(jnp.add, columns), 0), jnp.sqrt(inner(f, f))
+        return pushes, jnp.sqrt(inner(f, f)), _all((forces == 0) | problem.transmits)
 
     @once
     def moments(problem: Problem, pushes: jax.Array) -> list[jax.Array]:
         return [jnp.where(problem.present, x, 0) for x in cross(parts_of(problem.positions), parts_of(pushes))]
 
-    pushes, sizes = turned(problem, forces)
+    pushes, sizes, possible = turned(problem, forces)
     given = [_sum(part) for part in parts_of(pushes) + moments(problem, pushes)]
-    sizes = _sum(sizes)
-    wanted, size = parts_of(problem.wrench if wrench is None else wrench), problem.size
-    wanted = wanted[:3] + [moment / size for moment in wanted[3:]]
-    given = given[:3] + [moment / size for moment in given[3:]]
+    in_newtons = lambda parts: parts[:3] + [moment / problem.size for moment in parts[3:]]
+    load = in_newtons(parts_of(problem.wrench))
+    wanted = load if wrench is None else in_newtons(parts_of(wrench))
+    given = in_newtons(given)
     missing = fold(jnp.maximum, [jnp.abs(have - want) for have, want in zip(given, wanted, strict=True)])
+    # What a disturbance leaves of the load is rounded as the load itself is.
+    largest = fold(jnp.maximum, [jnp.abs(part) for part in (wanted if wrench is None else wanted + load)])
     # Forces that are nothing but rounding are none.
-    largest = jnp.maximum(fold(jnp.maximum, [jnp.abs(want) for want in wanted]), sizes)
+    largest = jnp.maximum(largest, _sum(sizes))
     largest = jnp.maximum(largest, _NOTHING[forces.dtype.name] * _max(jnp.where(problem.present, problem.max_force, 0)))
-    return missing <= MISSED[forces.dtype.name] * largest
+    return _all(possible) & (missing <= MISSED[forces.dtype.name] * largest)
+
+
+def reserves(problem: Problem, cone_edges: int) -> list[jax.Array]:
+    """What every facet keeps in reserve, (lanes, n or 1) each."""
+    assert problem.reserve is not None
+    kept = parts_of(problem.reserve)
+    return kept if len(kept) == cone_edges else kept * cone_edges
 
 
 def _weighed(weights: Sequence[float], parts: Sequence[jax.Array]) -> jax.Array:
@@ -257,6 +268,7 @@ def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -
     given = [part[:, None] for part in parts_of(y)]
     turned = [given[a] + moment for a, moment in enumerate(cross(given[3:], parts_of(problem.positions)))]
     along = [inner(column, turned) for column in zip(*rows_of(problem.frames), strict=True)]
+    along = [jnp.where(problem.transmits[..., k], part, 0) for k, part in enumerate(along)]
     return [first + along[0], second + along[1], normal * problem.friction - bound + along[2]]
 
 
@@ -268,7 +280,7 @@ def _lost(problem: Problem, residual: Sequence[jax.Array]) -> jax.Array:
 
 def _held(problem: Problem, cone: jax.Array, bound: jax.Array) -> jax.Array:
     """The contacts' part of h'z, (lanes, n)."""
-    return bound * problem.max_force - fold(jnp.add, parts_of(cone)) * problem.reserve[:, None]
+    return bound * problem.max_force - inner(parts_of(cone), reserves(problem, cone.shape[-1]))
 
 
 @once
@@ -313,19 +325,12 @@ def _of_efforts(hand: Hand, evidence: Evidence | Solution, rows: Rows) -> tuple:
     return more, (pull, value), (jnp.abs(residual) * effort_unit(hand)).sum(-1)
 
 
-def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None) -> jax.Array:
-    """Where the margin cannot be positive: a contact without friction has to slip, or wrenches lie outside the range.
+def _flat(solution: Solution, place: Range | None) -> jax.Array:
+    """Where the margin cannot be positive: wrenches lie outside the range of G.
 
-    Without S_1 and S_2 of its own the audit takes the solver's word for the latter, where the rank allows it.
+    Without S_1 and S_2 of its own the audit takes the solver's word for it, where the rank allows it.
     """
-    outside = _claims_flat(solution) if place is None else place.disturbance_outside & place.rank_stands
-    return _slips(problem, rows) | outside
-
-
-def _slips(problem: Problem, rows: Rows) -> jax.Array:
-    """Where a contact without friction would have to bear a tangential force, (lanes,)."""
-    loses = _max(rows.cone) > 1e-9 * rows_size(rows)[:, None]
-    return _any((problem.friction <= 0) & problem.present & loses)
+    return _claims_flat(solution) if place is None else place.disturbance_outside & place.rank_stands
 
 
 def _claims_flat(solution: Solution) -> jax.Array:
@@ -362,8 +367,7 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
         forces = parts_of(solution.forces)
         weighed, answered = forces, residual
         if problem.weights is not None:
-            eye = jnp.eye(3, dtype=solution.forces.dtype)
-            weights = rows_of(jnp.where(problem.present[:, :, None, None], problem.weights, eye))
+            weights = rows_of(_acting(problem, problem.weights))
             weighed, answered = [inner(row, forces) for row in weights], _divided(residual, weights)
         own = 0.5 * inner(forces, weighed)
         # The better of two bounds: without the contact's limits, and by the tangent at f_0 within them.
@@ -376,10 +380,16 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     effort, lower = (_sum(part) for part in bounds(problem, solution, more))
     assert asked is not None
     lower = lower - _sum(problem.wrench * y) - value - spent + asked * pull
-    largest = 1.0 if problem.weights is None else _max(jnp.abs(problem.weights), 2)
+    largest = 1.0 if problem.weights is None else _max(jnp.abs(_acting(problem, problem.weights)), 2)
     unit = _max(jnp.where(there, largest * problem.max_force**2, 0))
     near = CLOSED[dtype] * jnp.maximum(effort, 1e-3 * unit)
     return sound & (effort - lower <= near) & (jnp.abs(effort - solution.effort) <= near)
+
+
+def _acting(problem: Problem, weights: jax.Array) -> jax.Array:
+    """Q_0 of the components of force that contacts have, the identity of the others."""
+    both = problem.transmits[..., None] & problem.transmits[..., None, :]
+    return jnp.where(both, weights, jnp.eye(3, dtype=weights.dtype))
 
 
 def _added(vectors: list[jax.Array], more: jax.Array | None) -> list[jax.Array]:

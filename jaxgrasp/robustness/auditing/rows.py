@@ -100,7 +100,7 @@ def _stacked_rows(problem: Problem) -> jax.Array:
     frames = jnp.moveaxis(problem.frames, (2, 1, 3, 0), (0, 1, 2, 3))
     arms = jnp.moveaxis(problem.positions, (2, 1, 0), (0, 1, 2))[:, :, None]
     blocks = jnp.concatenate([frames, jnp.stack(cross(list(arms), list(frames))) / problem.size])
-    rows = jnp.where(problem.present.T[:, None], blocks, 0).reshape(6, -1, blocks.shape[-1])
+    rows = jnp.where(jnp.moveaxis(problem.transmits, 0, -1), blocks, 0).reshape(6, -1, blocks.shape[-1])
     hand = problem.hand
     if hand is None or hand.unreached is None:
         return rows
@@ -179,7 +179,7 @@ def _weighted(
     if compliance is None:
         return plain.inverse
     n = problem.present.shape[-1]
-    there = jnp.repeat(problem.present, 3, -1)
+    there = problem.transmits.reshape(-1, 3 * n)
     if compliance.shape[-2:] != (3 * n, 3 * n):
         blocks = jnp.eye(n, dtype=rows.dtype)[:, None, :, None] * compliance[:, :, :, None, :]
         compliance = blocks.reshape(blocks.shape[0], 3 * n, 3 * n)

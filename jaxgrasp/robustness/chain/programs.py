@@ -130,7 +130,7 @@ def scale_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_ed
     """The programs of one formulation for a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
     count, lanes = basics.disturbed.shape
-    parts = contact_rows(form.exact, cone_edges, norm_bound, grasps.friction)
+    parts = contact_rows(grasps, basics, form.exact, cone_edges, norm_bound)
     identities = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
     if form.free:
         length = jnp.sqrt(lax.stop_gradient(fold(jnp.add, basics.targets * basics.targets)))
@@ -182,22 +182,33 @@ def compute_blocking_forces(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
     return jnp.where(grasps.present > 0, forces, 0)
 
 
-def contact_rows(exact: bool, cone_edges: int, norm_bound: bool, friction: jax.Array) -> list[ConeRows]:
+def contact_rows(grasps: Grasps, basics: Basics, exact: bool, cone_edges: int, norm_bound: bool) -> list[ConeRows]:
     """The rows of a contact, without sigma: friction, then the bound on the force."""
+    friction = grasps.friction
     none = jnp.zeros((1, 1, 1, 1, 1), friction.dtype)
-    make = lambda kind, patterns, h, stretch=None: ConeRows(
-        second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch
+    make = lambda kind, patterns, h, stretch=None, reserve=None: ConeRows(
+        second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch, reserve=reserve
     )
     normal = (0.0, 0.0, -1.0)
     if not exact:
         facets = pyramid_facets(cone_edges).tolist()
-        return [make(False, [*facets, normal], (*[0.0] * cone_edges, 1.0))]
-    coulomb = make(True, [(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)], (0.0, 0.0, 0.0))
+        reserve = _reserve(grasps, basics, cone_edges, 1)
+        return [make(False, [*facets, normal], (*[0.0] * cone_edges, 1.0), reserve=reserve)]
+    rows = [(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)]
+    coulomb = make(True, rows, (0.0, 0.0, 0.0), reserve=_reserve(grasps, basics, 1, 2))
     if not norm_bound:
         return [coulomb, make(False, [normal], (1.0,))]
     slip = jnp.maximum(friction, LEAST_FRICTION[friction.dtype.name])[:, None]
     stretch = jnp.stack([slip, slip, jnp.ones_like(slip)])
     return [coulomb, make(True, [(0.0, 0.0, 0.0), *(-np.eye(3)).tolist()], (1.0, 0.0, 0.0, 0.0), stretch)]
+
+
+def _reserve(grasps: Grasps, basics: Basics, rows: int, others: int) -> jax.Array | None:
+    """What d takes from the first rows of a contact, and nothing from the others: (rows + others, 1, n, 1, *lanes)."""
+    if grasps.reserve is None:
+        return None
+    taken = grasps.row_reserves(basics.sizes[0], rows)
+    return jnp.concatenate([taken, jnp.zeros((others, *taken.shape[1:]), taken.dtype)])[:, None, :, None]
 
 
 def _identity(second_order: bool, rows: int, dtype: jnp.dtype) -> jax.Array:

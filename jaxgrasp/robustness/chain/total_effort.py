@@ -77,6 +77,7 @@ def least_total_effort(
     compliance: ArrayLike | None = None,
     effort_weights: ArrayLike | None = None,
     cone_edges: int = 8,
+    cone_margin: ArrayLike | None = None,
 ) -> TotalEffortSolution:
     """Program (11): tightening forces and free answers to every disturbance, of least effort together.
 
@@ -93,6 +94,7 @@ def least_total_effort(
         compliance: Q as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the identity.
         effort_weights: Q_0, as blocks; None is the identity.
         cone_edges: n_e.
+        cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`; None is none.
 
     Returns:
         TotalEffortSolution with `*batch` axes.
@@ -110,7 +112,9 @@ def least_total_effort(
     check_vertices(disturbances)
     if compliance is not None and jnp.shape(compliance)[-3:] != (contacts.n_c, 3, 3):
         raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {contacts.n_c}, 3, 3)")
-    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    data = GraspData.from_arguments(
+        contacts, disturbances, required_wrench, compliance, cone_margin, cone_edges=cone_edges
+    )
     options = Options(
         margin=as_float("margin", margin, ()), effort_weights=optional_float("effort_weights", effort_weights)
     )
@@ -195,6 +199,7 @@ class _TotalEffort(OfPyramids, Audited):
         # Without a load and disturbances no forces at all are the optimum. What rounding leaves of no wrench counts as
         # none: a grasp that withstands none has no room inside its rows.
         forceless = active & (jnp.abs(problem.rhs) <= _NO_WRENCH[dtype]).all((0, 1))
+        forceless = forceless if grasps.reserve is None else forceless & grasps.reserves_nothing
         out = interior_point.solve(problem, settings, active & ~forceless)
         record = jax.tree.map(lambda v: jnp.where(forceless, 0, v), out.record)
         gap = (record.upper - record.lower) / problem.gap_scale(record)
@@ -205,7 +210,7 @@ class _TotalEffort(OfPyramids, Audited):
         ).astype(jnp.int32)
         has_forces = active & jnp.isfinite(record.upper)
         where_forces = lambda v: jnp.where(has_forces, v, jnp.nan)
-        forces = jnp.moveaxis(record.x * (basics.sizes * grasps.present)[:, :, None], (2, 1), (0, 1))
+        forces = jnp.moveaxis(record.x * (basics.sizes * grasps.transmits)[:, :, None], (2, 1), (0, 1))
         solution = TotalEffortSolution(
             effort=where_forces(record.upper * unit),
             lower_bound=where_forces(record.lower * unit),
@@ -256,6 +261,9 @@ def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) 
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     targets = jnp.concatenate([basics.load[:, None] - _asked(grasps) * basics.targets, basics.load[:, None]], 1)
     patterns, h = build_rows(pyramid_facets(cone_edges), dtype, 3)
+    if grasps.reserve is not None:
+        reserve = grasps.row_reserves(basics.sizes[0], cone_edges)[:, :, None]
+        h = jnp.concatenate([h[:-1] - reserve, jnp.broadcast_to(h[-1:], reserve[:1].shape)])
     problem = ArrowProblem(
         patterns=patterns,
         h=h,

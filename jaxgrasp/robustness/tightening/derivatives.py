@@ -112,11 +112,15 @@ def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, with_terms: bo
         zero = replace(zero, options=replace(zero.options, effort_weights=rows.weights))
     if rows.margin is not None:
         zero = replace(zero, options=replace(zero.options, margin=rows.margin))
+    assert grasps.reserve is not None
+    reserve = rows.cone
+    while reserve.ndim > grasps.reserve.ndim:
+        reserve = fold(jnp.add, reserve)
     return replace(
         zero,
         friction=rows.friction + friction,
         max_force=-rows.bound,
-        reserve=fold(jnp.add, fold(jnp.add, rows.cone)),
+        reserve=reserve,
         columns=rows.columns + columns,
         wrench=rows.wrench,
         terms=zero.terms if terms is None else terms,
@@ -182,8 +186,7 @@ def _central_adjoint(
     iterate = scale_point(problem, program, point, unit, central_kappa(objective, grasps, unit))
     where_usable = lambda x: None if x is None else jnp.where(point.usable, x, 0)
     forces = jnp.where(point.usable, point.forces, 0)
-    scales = jnp.stack([program.tangential, program.tangential, program.normal])
-    units = _Units(scales, program.row_units(), unit)
+    units = _Units(program.force_units, program.row_units(), unit)
     ct = cotangents._replace(**{name: where_usable(part) for name, part in cotangents._asdict().items()})
 
     # K m = c.

@@ -43,6 +43,10 @@ def largest_disturbance(
     |f_n|, where the paper's section V-A speaks of the force norm: f_max / sqrt(1 + mu^2) keeps |f| below f_max, too.
     docs/paper.md has what that changes.
 
+    A contact with friction exactly 0 transmits its normal force alone: f_0 and G* have no tangential forces there, Q
+    and Q_0 no rows and columns, and its rows of C are cos(pi / n_e) f_n <= -d, since (1) would let it pull. Fewer than
+    seven such contacts do not close a grasp, but disturbances in the range of their G are withstood.
+
     lambda is left free: where even b cannot be borne the status is INFEASIBLE and a negative margin is the proof. A
     grasp without force closure and without load has margin 0.
 
@@ -53,7 +57,11 @@ def largest_disturbance(
         compliance: Q of (14), contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3), full
             (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity.
         cone_edges: n_e, edges of the friction pyramid, which is inscribed in Coulomb's cone.
-        cone_margin: d (*batch,), N, >= 0: what every facet row keeps in reserve.
+        cone_margin: d, N, >= 0, what facet rows keep in reserve: one value a grasp (*batch,), a contact (*batch, n_c)
+            or a row (*batch, n_c, n_e). Row k is (cos a_k, sin a_k, mu cos(pi/n_e)) f <= -d with a_k = (2 k + 1) pi /
+            n_e from t1: d is the tangential force along that facet that is left before the row gives way. Its number
+            of axes decides: as many as the batch of all other arguments, or less, is one value a grasp, one more a
+            contact, two more a row. `jax.vmap` tries several on one grasp. Values of absent contacts do not count.
         smoothing: kappa (*batch,), > 0, in units of the margin: answer with the central point, where s z = kappa in
             every row, instead of the optimum. Margin and forces are then smooth and unique, and the margin is below
             the optimum by about kappa for every active row. None is the exact optimum.
@@ -79,10 +87,14 @@ def largest_disturbance(
         Of margin (and upper_bound), forces, effort and multipliers with respect to everything that is continuous, of
         any order. The exact margin's gradient is that of the Lagrangian (envelope theorem), at kinks a subgradient;
         that of exact forces belongs to the central point for 1e-6 (float32: 1e-4) of the margin's natural scale. With
-        smoothing all are those of the answer. Exactly zero for grasps without a finite margin.
+        smoothing all are those of the answer. Exactly zero for grasps without a finite margin. At friction 0 the
+        margin jumps, as G* takes tangential forces up: there the derivative by friction is 0, all others are those of
+        the frictionless contact.
     """
     pyramid_facets(cone_edges)
-    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin, actuation)
+    data = GraspData.from_arguments(
+        contacts, disturbances, required_wrench, compliance, cone_margin, actuation, cone_edges
+    )
     options = Options(smoothing=optional_float("smoothing", smoothing), cutoff=optional_float("cutoff", cutoff))
     return over_grasps(_LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)[0]
 

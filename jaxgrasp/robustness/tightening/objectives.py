@@ -41,7 +41,7 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
     blocks, *others = program.groups
     dtype, asked = program.rhs.dtype, grasps.options.margin
     assert asked is not None
-    margin = jnp.where(program.disturbance_outside | program.slippery, 0, asked / program.scale)
+    margin = jnp.where(program.disturbance_outside, 0, asked / program.scale)
     eye = jnp.eye(3, dtype=dtype)[..., None, None]
     # H = D Q_0 D = root'root with root = R D, Q_0 = R'R and the units D of forces.
     root = eye if grasps.weight_roots is None else grasps.weight_roots

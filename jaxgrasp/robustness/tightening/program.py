@@ -62,6 +62,8 @@ class ScaledProgram:
     """(n_e + 1, n, *lanes), right-hand sides."""
     present: jax.Array
     """(n, *lanes), 1 or 0."""
+    rough: jax.Array
+    """(n, *lanes), 1 where there is friction, else 0."""
     rhs: jax.Array
     """(eq, *lanes), coordinates of b in the orthonormal rows; zero where dropped."""
     dropped: jax.Array
@@ -90,9 +92,6 @@ class ScaledProgram:
     """bool (*lanes): the set has wrenches outside the range of G."""
     wrench_outside: jax.Array
     """bool (*lanes): b is outside the range of G."""
-    slippery: jax.Array
-    """bool (*lanes): a contact without friction has to bear tangential force, so the margin cannot be positive."""
-
     actuators: ActuatorRows | None
     """What the actuators add; None where there are none."""
     joint_sizes: jax.Array | None
@@ -124,7 +123,13 @@ class ScaledProgram:
 
     def forces(self, x: jax.Array) -> jax.Array:
         """Turn scaled forces (3, n, *lanes) into contact forces (n, 3, *lanes), N."""
-        return jnp.stack([x[0] * self.tangential, x[1] * self.tangential, x[2] * self.normal], 1)
+        return jnp.swapaxes(x * self.force_units, 0, 1)
+
+    @property
+    def force_units(self) -> jax.Array:
+        """(3, n, *lanes), N: what scaled forces are worth, nothing along tangents without friction."""
+        tangential = self.tangential * self.rough
+        return jnp.stack([tangential, tangential, self.normal])
 
     def row_units(self) -> jax.Array:
         """The unit of every scaled row, (n_e + 1, n, *lanes), N."""
@@ -186,6 +191,7 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
         sigma=rows.sigma,
         h=rows.h,
         present=present,
+        rough=grasps.rough,
         rhs=coordinates * kept,
         dropped=1 - kept,
         scale=rows.scale,
@@ -200,7 +206,6 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
         undisturbed=rows.undisturbed,
         disturbance_outside=reach > tolerance,
         wrench_outside=wrench_outside,
-        slippery=((grasps.friction <= 0) & (fold(jnp.maximum, losses.cone) > 0)).any(0),
         actuators=actuators,
         joint_sizes=equalities.joint_sizes,
     )
@@ -251,6 +256,7 @@ def _scale_rows(grasps: Grasps, losses: RowLosses, tangential: jax.Array, unit: 
         return sigmas, h, scale, undisturbed
 
     actuators = None if losses.actuators is None or unit is None else losses.actuators / unit
+    assert grasps.reserve is not None
     sigmas, h, scale, undisturbed = scale_rows(
         losses.cone, losses.bound, actuators, tangential, grasps.max_force, grasps.reserve
     )
@@ -324,9 +330,10 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
     more than rounding turns the others by more than 1e-7.
 
     In float32 a row that is nearly dependent makes S_1 and S_2 wrong by eps over what was left of it. One that was
-    dropped may be dependent or not, unless the contacts themselves say so: all on one line, to the last bit. A
-    disturbance set that leaves the range by little more than rounding has margin 0, or none of it at all. Rows of
-    joints that no actuator reaches are dependent where they look so.
+    dropped may be dependent or not, unless the contacts themselves say so: all on one line, to the last bit, or, some
+    without friction, with fewer components of force than rows, or with nothing at all left of a row. A disturbance set
+    that leaves the range by little more than rounding has margin 0, or none of it at all. Rows of joints that no
+    actuator reaches are dependent where they look so.
     """
     ratios, kept = basis.ratios, basis.kept > 0
     if ratios.dtype == jnp.float64:
@@ -338,6 +345,8 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
         dependent = (most * least <= rounding) & (least > 1e-8)
         return (least * second <= rounding) | (most > _MOST_TURNED * least) & ~dependent
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
-    doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
+    rows, smooth = fold(jnp.add, kept[:6].astype(ratios.dtype)), (grasps.rough < grasps.present).any(0)
+    certain = (rows == fold(jnp.add, fold(jnp.add, grasps.transmits))) | (kept[:6] | (ratios[:6] == 0)).all(0)
+    doubtful = short | (~kept[:6].all(0) & ~grasps.lined & ~(smooth & certain))
     doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)
     return doubtful if len(ratios) == 6 else doubtful | ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)
