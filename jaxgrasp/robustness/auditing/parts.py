@@ -47,3 +47,12 @@ def inner(a: Sequence[jax.Array], b: Sequence[jax.Array]) -> jax.Array:
 def cross(a: Sequence[jax.Array], b: Sequence[jax.Array]) -> list[jax.Array]:
     """The cross product."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def divided(vectors: Sequence[jax.Array], matrices: list[list[jax.Array]]) -> list[jax.Array]:
+    """Q^-1 v by components, by the adjugate."""
+    a, b, c = matrices
+    # The columns of the adjugate.
+    columns = cross(b, c), cross(c, a), cross(a, b)
+    determinant = inner(a, columns[0])
+    return [inner(row, vectors) / determinant for row in zip(*columns, strict=True)]

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold, fold_last
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.robustness.auditing import hidden
-from jaxgrasp.robustness.auditing.parts import cross, inner, once, parts_of, rows_of
+from jaxgrasp.robustness.auditing.parts import cross, divided, inner, once, parts_of, rows_of
 from jaxgrasp.robustness.auditing.problem import Hand, Problem, problem_of
 from jaxgrasp.robustness.auditing.rows import Range, Rows, own_rows
 from jaxgrasp.robustness.interface.arguments import Arguments
@@ -368,7 +368,7 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
         weighed, answered = forces, residual
         if problem.weights is not None:
             weights = rows_of(_acting(problem, problem.weights))
-            weighed, answered = [inner(row, forces) for row in weights], _divided(residual, weights)
+            weighed, answered = [inner(row, forces) for row in weights], divided(residual, weights)
         own = 0.5 * inner(forces, weighed)
         # The better of two bounds: without the contact's limits, and by the tangent at f_0 within them.
         tangent = [w + r for w, r in zip(weighed, residual, strict=True)]
@@ -395,12 +395,3 @@ def _acting(problem: Problem, weights: jax.Array) -> jax.Array:
 def _added(vectors: list[jax.Array], more: jax.Array | None) -> list[jax.Array]:
     """Vectors by components and others (lanes, n, 3), if there are any."""
     return vectors if more is None else [a + b for a, b in zip(vectors, parts_of(more), strict=True)]
-
-
-def _divided(vectors: Sequence[jax.Array], matrices: list[list[jax.Array]]) -> list[jax.Array]:
-    """Q^-1 v by components, by the adjugate."""
-    a, b, c = matrices
-    # The columns of the adjugate.
-    columns = cross(b, c), cross(c, a), cross(a, b)
-    determinant = inner(a, columns[0])
-    return [inner(row, vectors) / determinant for row in zip(*columns, strict=True)]
