@@ -1,6 +1,5 @@
 """The data of the grasps as the audit sees them: the public arguments, lanes leading, in newtons and metres."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -9,7 +8,6 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold_last
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
-from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.robustness.actuators import Actuated, clip_limits
 from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
@@ -18,9 +16,9 @@ from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
 class Problem(NamedTuple):
     """Grasps and what is asked of them; leaves (lanes, ...), or (1, ...) where all lanes share them.
 
-    positions, frames, friction, max_force: as in `Contacts`; zero where a contact is absent, but for max_force, 1. A
-        contact without friction has tangents of zero, which do nothing, and friction 1: the rows of C then say that it
-        does not pull.
+    positions, frames: as in `Contacts`; whatever is given where a contact is absent.
+    friction, max_force: as in `Contacts`; 0 and 1 where a contact is absent. A contact without friction has friction 1:
+        the rows of C then say that it does not pull.
     present: bool (lanes, n).
     transmits: bool (lanes, n, 3), which components of force a contact has: without friction the normal one alone.
     size: (lanes,), m, root-mean-square distance of the contacts from the centre of mass; 1 where that is zero.
@@ -71,11 +69,8 @@ def problem_of(arguments: Arguments) -> Problem:
     present, rough = contacts.active, contacts.active & (contacts.friction > 0)
     transmits = jnp.stack([rough, rough, jnp.broadcast_to(present, rough.shape)], -1)
     here = lambda x, other: jnp.where(present.reshape(*present.shape, *[1] * (x.ndim - 2)), x, other)
-    positions, friction, max_force = (
-        here(contacts.positions, 0),
-        here(jnp.where(rough, contacts.friction, 1), 0),
-        here(contacts.max_force, 1),
-    )
+    positions = here(contacts.positions, 0)
+    friction, max_force = here(jnp.where(rough, contacts.friction, 1), 0), here(contacts.max_force, 1)
     count = jnp.maximum(fold_last(jnp.add, present.astype(positions.dtype)), 1)
     # In units of the largest, whose square may be more, or less, than there are numbers for.
     largest = fold_last(jnp.maximum, jnp.abs(positions), 2)
@@ -83,8 +78,8 @@ def problem_of(arguments: Arguments) -> Problem:
     square = fold_last(jnp.add, (positions / largest[:, None, None]) ** 2, 2) / count
     strongest = jnp.where(present, max_force, 0)
     return Problem(
-        positions=positions,
-        frames=jnp.where(transmits[:, :, None], contacts.frames, 0),
+        positions=contacts.positions,
+        frames=contacts.frames,
         friction=friction,
         max_force=max_force,
         present=present,
@@ -134,18 +129,7 @@ def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_fo
     )
 
 
-def picked(arguments: Arguments, turn: jax.Array, stride: int) -> Arguments:
-    """The arguments of one lane in `stride`, see `every`."""
-    pick = lambda x, shared: x if shared else every(x, turn, stride)
-    return replace(arguments, inputs=jax.tree.map(pick, arguments.inputs, arguments.shared))
-
-
 def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:
     """Lane `turn` of every `stride` lanes; what is left over at the end is not looked at."""
     blocks = x[: x.shape[0] // stride * stride].reshape(-1, stride, *x.shape[1:])
     return jax.lax.dynamic_index_in_dim(blocks, turn, 1, keepdims=False)
-
-
-def facets(cone_edges: int, dtype: jnp.dtype) -> jax.Array:
-    """The facet rows (n_e, 3) for unit friction."""
-    return jnp.asarray(pyramid_facets(cone_edges), dtype)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.robustness.auditing.pyramids import Evidence
+from jaxgrasp.robustness.auditing.multipliers import Evidence
 from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.interface.solution import Solution
