@@ -59,8 +59,37 @@ def read_candidates(
 
 def _read_file(path: Path, friction: float | None, max_force: float | None, with_mass: bool) -> Candidates:
     with open_archive(path, "an .npz file of candidates (numpy.savez)") as archive:
+        fields = fields_of(path, archive)
+        arrays = archive.read(fields)
         there = tuple(archive.headers)
-        arrays = _of_candidates(path, archive)
+    return candidates_of_arrays(path, arrays, there=there, friction=friction, max_force=max_force, with_mass=with_mass)
+
+
+def candidates_of_arrays(
+    path: Path | str,
+    arrays: dict[str, np.ndarray],
+    *,
+    there: Collection[str],
+    friction: float | None,
+    max_force: float | None,
+    with_mass: bool,
+) -> Candidates:
+    """Makes candidates of a file's arrays, those with a leading axis of N in part or whole.
+
+    Args:
+        path: The file, for messages and as the source.
+        arrays: Its arrays by name, of `fields_of`.
+        there: The names of all fields of the file, for messages.
+        friction: Coulomb's coefficient where the file has none.
+        max_force: Largest normal force where the file has none, N.
+        with_mass: Whether there must be masses.
+
+    Returns:
+        The candidates, numbered from 0.
+
+    Raises:
+        CandidateError: An array is missing or cannot be used.
+    """
     positions = _numbers(path, "positions", arrays["positions"])
     count, contacts = positions.shape[:2]
 
@@ -75,8 +104,7 @@ def _read_file(path: Path, friction: float | None, max_force: float | None, with
     def per_contact(name: str, given: float | None) -> np.ndarray:
         value = optional(name, ((), (count,), (count, contacts)))
         if value is None and given is None:
-            option = "--" + name.replace("_", "-")
-            _missing(path, there, name, f"the column, or one value for all with {name}= ({option})")
+            refuse_missing(path, there, name, wanted_for(name))
         value = np.asarray(given if value is None else value, dtype=float)
         return np.broadcast_to(value[:, None] if value.ndim == 1 else value, (count, contacts))
 
@@ -85,10 +113,10 @@ def _read_file(path: Path, friction: float | None, max_force: float | None, with
     frames = optional("frames", ((count, contacts, 3, 3),))
     normals = optional("outward_normals", ((count, contacts, 3),))
     if frames is None and normals is None:
-        _missing(path, there, "outward_normals", "outward_normals (N, n_c, 3) or frames (N, n_c, 3, 3)")
+        refuse_missing(path, there, "outward_normals", "outward_normals (N, n_c, 3) or frames (N, n_c, 3, 3)")
     mass = optional("mass", ((), (count,)))
     if mass is None and with_mass:
-        _missing(path, there, "mass", "the column, because gravity needs it")
+        refuse_missing(path, there, "mass", wanted_for("mass"))
     return Candidates(
         positions=positions,
         outward_normals=normals,
@@ -104,30 +132,61 @@ def _read_file(path: Path, friction: float | None, max_force: float | None, with
     )
 
 
-def _of_candidates(path: Path, archive: Archive) -> dict[str, np.ndarray]:
-    """Reads the arrays that have something to say of each candidate."""
+def fields_of(path: Path | str, archive: Archive) -> tuple[str, ...]:
+    """The arrays of an archive that have something to say of each candidate.
+
+    Raises:
+        CandidateError: There are no positions, or not of that shape, or a name is misspelt.
+    """
     headers = archive.headers
-    _refuse_misspelt(path, headers)
+    refuse_misspelt(path, headers)
     if "positions" not in headers:
-        _missing(path, headers, "positions", "the column")
+        refuse_missing(path, headers, "positions", "the column")
     shape = headers["positions"].shape
     if len(shape) != 3 or shape[2] != 3 or shape[1] == 0:
         raise CandidateError(path, "positions", f"shape {shape}", "(N, n_c, 3)")
     if shape[0] == 0:
         raise CandidateError(path, "positions", f"no candidates (shape {shape})", "at least one")
-    if shape[1] > _MOST_CONTACTS:
-        raise CandidateError(path, "positions", f"{shape[1]:,} contacts", f"at most {_MOST_CONTACTS} a candidate")
-    return archive.read(name for name in headers if name in FIELDS or headers[name].shape[:1] == shape[:1])
+    check_contacts(path, shape[1])
+    return tuple(name for name in headers if name in FIELDS or headers[name].shape[:1] == shape[:1])
 
 
-def _missing(path: Path, there: Collection[str], name: str, wanted: str) -> NoReturn:
+def check_contacts(path: Path | str, contacts: int) -> None:
+    """Refuses candidates with too many contacts.
+
+    Raises:
+        CandidateError: There are more than 64.
+    """
+    if contacts > _MOST_CONTACTS:
+        raise CandidateError(path, "positions", f"{contacts:,} contacts", f"at most {_MOST_CONTACTS} a candidate")
+
+
+def wanted_for(name: str) -> str:
+    """What is wanted where a field is missing."""
+    if name == "mass":
+        return "the column, because gravity needs it"
+    option = "--" + name.replace("_", "-")
+    return f"the column, or one value for all with {name}= ({option})"
+
+
+def refuse_missing(path: Path | str, there: Collection[str], name: str, wanted: str) -> NoReturn:
+    """Refuses a file without a field, and names what is similar in it.
+
+    Raises:
+        CandidateError: Always.
+    """
     unknown = [other for other in there if other not in FIELDS]
     near = _nearest(name, unknown, _PERHAPS_MEANT)
     got = f"no such column (there is {f'a similar {near!r}' if near else ', '.join(there) or 'nothing'})"
     raise CandidateError(path, name, got, wanted)
 
 
-def _refuse_misspelt(path: Path, there: Collection[str]) -> None:
+def refuse_misspelt(path: Path | str, there: Collection[str]) -> None:
+    """Refuses names that are nearly those of fields which are absent.
+
+    Raises:
+        CandidateError: There is one.
+    """
     # Passed over in silence, 'max_forces' would mean a ranking by other forces than the file's.
     absent = [name for name in FIELDS if name not in there]
     if "frames" in there or "outward_normals" in there:
@@ -144,13 +203,13 @@ def _nearest(name: str, others: Iterable[str], cutoff: float) -> str | None:
     return by_lower[found[0]] if found else None
 
 
-def _numbers(path: Path, name: str, value: np.ndarray) -> np.ndarray:
+def _numbers(path: Path | str, name: str, value: np.ndarray) -> np.ndarray:
     if value.dtype.kind not in "iuf":
         raise CandidateError(path, name, f"dtype {value.dtype}", "real numbers")
     return value.astype(np.float64, copy=False)
 
 
-def _active(path: Path, value: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
+def _active(path: Path | str, value: np.ndarray | None, shape: tuple[int, int]) -> np.ndarray:
     if value is None:
         return np.broadcast_to(True, shape)
     if value.dtype != np.bool_ or value.shape != shape:
@@ -158,7 +217,7 @@ def _active(path: Path, value: np.ndarray | None, shape: tuple[int, int]) -> np.
     return value
 
 
-def _travelling(path: Path, arrays: dict[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
+def _travelling(path: Path | str, arrays: dict[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
     columns = {}
     for name, value in arrays.items():
         known = name in FIELDS and name != "center_of_mass"

@@ -4,6 +4,7 @@ from jaxgrasp.storage.arrays import (
     PICKLE_COST,
     Archive,
     Header,
+    archive_in,
     array_of_bytes,
     open_archive,
     read_archive,
@@ -13,18 +14,22 @@ from jaxgrasp.storage.arrays import (
 )
 from jaxgrasp.storage.cache import cache_folder
 from jaxgrasp.storage.reading import FileError, allowance, limited_to, open_regular, printable, reason_of
-from jaxgrasp.storage.writing import atomic_write, check_writable, discard_unfinished, made_folder, unfinished
+from jaxgrasp.storage.rows import ArchiveRows
+from jaxgrasp.storage.writing import atomic_write, check_writable, claimed, discard_unfinished, made_folder, unfinished
 
 __all__ = [
     "PICKLE_COST",
     "Archive",
+    "ArchiveRows",
     "FileError",
     "Header",
     "allowance",
+    "archive_in",
     "array_of_bytes",
     "atomic_write",
     "cache_folder",
     "check_writable",
+    "claimed",
     "discard_unfinished",
     "limited_to",
     "made_folder",

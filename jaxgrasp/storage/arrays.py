@@ -20,8 +20,8 @@ import numpy as np
 from jaxgrasp.storage.reading import FileError, allowance, in_bytes, open_regular, reason_of
 
 # What zipfile and zlib raise for damaged, encrypted or oddly compressed members.
-_BROKEN = (ValueError, KeyError, IndexError, EOFError, OSError, RuntimeError, MemoryError, OverflowError)
-_BROKEN += (zipfile.BadZipFile, zlib.error, struct.error)
+BROKEN = (ValueError, KeyError, IndexError, EOFError, OSError, RuntimeError, MemoryError, OverflowError)
+BROKEN += (zipfile.BadZipFile, zlib.error, struct.error)
 _MAGIC = b"\x93NUMPY"
 # NumPy takes a millisecond for a thousand characters. Headers of plain arrays have at most some 800.
 _HEADER = 1024
@@ -63,7 +63,7 @@ class Header:
 class Archive:
     """An open `.npz` file, see `open_archive`."""
 
-    def __init__(self, path: Path, archive: zipfile.ZipFile):
+    def __init__(self, path: Path | str, archive: zipfile.ZipFile):
         """Reads the headers of all members, and none of their data."""
         self._path, self._archive = path, archive
         self.headers: dict[str, Header] = {}
@@ -93,10 +93,36 @@ class Archive:
         self._check_cost(names)
         return {name: self._read(name) for name in names}
 
+    def open_data(self, names: Iterable[str]) -> dict[str, BinaryIO]:
+        """Opens some of the arrays where their data begin, for files that are larger than memory.
+
+        Args:
+            names: Of `headers`.
+
+        Raises:
+            FileError: One of them is damaged, or has Python objects, or they would inflate a hundredfold.
+        """
+        names = tuple(names)
+        self._check_inflation(names)
+        opened = {}
+        for name in names:
+            _refuse_objects(self._path, name, self.headers[name].dtype)
+            try:
+                opened[name] = self._open(name, self._members[name])
+                opened[name].read(self.headers[name].offset)
+            except BROKEN as error:
+                damaged(self._path, name, error)
+        return opened
+
     def _check_cost(self, names: tuple[str, ...]) -> None:
-        headers, members = [self.headers[name] for name in names], [self._members[name] for name in names]
+        headers = [self.headers[name] for name in names]
         largest = max(names, key=lambda name: self.headers[name].cost, default=None)
         _check_cost(self._path, largest, sum(header.cost for header in headers))
+        self._check_inflation(names)
+
+    def _check_inflation(self, names: tuple[str, ...]) -> None:
+        members = [self._members[name] for name in names]
+        largest = max(names, key=lambda name: self.headers[name].cost, default=None)
         inflated, stored = (sum(getattr(m, which) for m in members) for which in ("file_size", "compress_size"))
         if inflated > max(_SMALL, _INFLATION * stored):
             got = f"{in_bytes(stored)} that inflate to {in_bytes(inflated)}"
@@ -106,8 +132,8 @@ class Archive:
         try:
             with self._open(name, member) as stream:
                 start = stream.read(_HEADER + 12)
-        except _BROKEN as error:
-            _damaged(self._path, name, error)
+        except BROKEN as error:
+            damaged(self._path, name, error)
         if not start.startswith(_MAGIC):
             raise FileError(self._path, name, "a member that is no array", "arrays only")
         header = _parsed(self._path, name, start)
@@ -128,8 +154,8 @@ class Archive:
                         raise EOFError("it ends early")
                 # At the end zipfile compares the checksum.
                 stream.read(1)
-        except _BROKEN as error:
-            _damaged(self._path, name, error)
+        except BROKEN as error:
+            damaged(self._path, name, error)
         return array_of_bytes(self._path, name, header, data)
 
     def _open(self, name: str, member: zipfile.ZipInfo) -> Any:
@@ -153,19 +179,34 @@ def open_archive(path: Path | str, wanted: str = "an .npz file (numpy.savez)") -
         FileError: The file is absent, unreadable, not an archive, truncated or damaged.
     """
     path = Path(path)
-    with open_regular(path, wanted) as stream:
-        try:
-            magic = stream.read(len(_MAGIC))
-            # zipfile would also find an archive behind something else, which NumPy takes for no archive.
-            if not magic.startswith(b"PK") or not zipfile.is_zipfile(stream):
-                _refuse_kind(path, magic, wanted)
-            archive = zipfile.ZipFile(_Bounded(stream))  # type: ignore[arg-type]
-        except FileError:
-            raise
-        except _BROKEN as error:
-            _damaged(path, None, error)
-        with archive:
-            yield Archive(path, archive)
+    with open_regular(path, wanted) as stream, archive_in(stream, path, wanted) as archive:
+        yield archive
+
+
+@contextlib.contextmanager
+def archive_in(stream: BinaryIO, path: Path | str, wanted: str = "an .npz file (numpy.savez)") -> Iterator[Archive]:
+    """Opens the `.npz` file that a stream of bytes is, see `open_archive`.
+
+    Args:
+        stream: The file's bytes; it can be sought in.
+        path: The file, for messages.
+        wanted: What the file should be, for the message.
+
+    Raises:
+        FileError: It is not an archive, truncated or damaged.
+    """
+    try:
+        magic = stream.read(len(_MAGIC))
+        # zipfile would also find an archive behind something else, which NumPy takes for no archive.
+        if not magic.startswith(b"PK") or not zipfile.is_zipfile(stream):
+            _refuse_kind(path, magic, wanted)
+        archive = zipfile.ZipFile(_Bounded(stream))  # type: ignore[arg-type]
+    except FileError:
+        raise
+    except BROKEN as error:
+        damaged(path, None, error)
+    with archive:
+        yield Archive(path, archive)
 
 
 def read_archive(path: Path | str) -> dict[str, np.ndarray]:
@@ -256,8 +297,8 @@ def read_members(path: Path | str, wanted: str) -> dict[str, bytes]:
                 if not plain or sum(m.file_size for m in members) > size or len(members) > _MEMBERS:
                     raise FileError(path, None, "members that are compressed, overlap or are too many", wanted)
                 return {member.filename: archive.read(member) for member in members}
-        except _BROKEN as error:
-            _damaged(path, None, error, wanted)
+        except BROKEN as error:
+            damaged(path, None, error, wanted)
 
 
 class _Bounded:
@@ -273,14 +314,14 @@ class _Bounded:
         return self._stream.read(size)
 
 
-def _refuse_kind(path: Path, magic: bytes, wanted: str) -> NoReturn:
+def _refuse_kind(path: Path | str, magic: bytes, wanted: str) -> NoReturn:
     if magic.startswith(b"PK\x03\x04"):
         raise FileError(path, None, "a truncated .npz file", "the whole of it")
     kind = {b"": "an empty file", _MAGIC: "a single .npy array"}.get(magic, "a file of another kind")
     raise FileError(path, None, kind, wanted)
 
 
-def _parsed(path: Path, name: str | None, start: bytes) -> Header:
+def _parsed(path: Path | str, name: str | None, start: bytes) -> Header:
     """The header at the start of an array's file."""
     stream = io.BytesIO(start)
     length = int.from_bytes(start[8 : 10 if start[6:7] == b"\1" else 12], "little")
@@ -303,12 +344,12 @@ def _parsed(path: Path, name: str | None, start: bytes) -> Header:
     return Header(shape, dtype, fortran_order, stream.tell())
 
 
-def _refuse_objects(path: Path, name: str | None, dtype: np.dtype) -> None:
+def _refuse_objects(path: Path | str, name: str | None, dtype: np.dtype) -> None:
     if dtype.hasobject:
         raise FileError(path, name, "Python objects, which are never unpickled", "a plain array")
 
 
-def _check_cost(path: Path, name: str | None, cost: int) -> None:
+def _check_cost(path: Path | str, name: str | None, cost: int) -> None:
     if cost > allowance():
         limit = f"at most {in_bytes(allowance())} (see --read-limit)"
         raise FileError(path, name, f"arrays that take {in_bytes(cost)} in memory", limit)
@@ -337,7 +378,12 @@ def array_of_bytes(path: Path | str, name: str | None, header: Header, data: np.
     return array.T if header.fortran_order else array
 
 
-def _damaged(path: Path, name: str | None, error: Exception, wanted: str = "an intact .npz file") -> NoReturn:
+def damaged(path: Path | str, name: str | None, error: Exception, wanted: str = "an intact .npz file") -> NoReturn:
+    """Refuses a file for what was raised while it was read.
+
+    Raises:
+        FileError: Always.
+    """
     if isinstance(error, FileError):
         raise error
     raise FileError(path, name, f"damaged data ({reason_of(error)})", wanted) from error

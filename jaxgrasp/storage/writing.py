@@ -104,6 +104,23 @@ def check_writable(path: Path | str) -> None:
     _unfinished.discard(part)
 
 
+@contextlib.contextmanager
+def claimed(path: Path | str) -> Iterator[None]:
+    """Keeps other processes from claiming the same file while this block runs; the file is made where it is not there.
+
+    Raises:
+        BlockingIOError: Another process has claimed it.
+        OSError: It cannot be opened.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
+    try:
+        if _locked(descriptor) is False:
+            raise BlockingIOError(errno.EAGAIN, "another process is at work on it", str(path))
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def unfinished() -> bool:
     """Whether this process is writing a file now."""
     return bool(_unfinished)
