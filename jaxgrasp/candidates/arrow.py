@@ -17,8 +17,8 @@ from jaxgrasp.candidates.reader import (
     CandidateError,
     candidates_of_arrays,
     check_contacts,
-    refuse_misspelt,
     refuse_missing,
+    refuse_misspelt,
 )
 
 _OWN = tuple(name for name in FIELDS if name != "center_of_mass")
@@ -141,9 +141,9 @@ def _arrays(table: pa.Table, name: Path | str) -> dict[str, np.ndarray]:
 
 
 def _dense(array: pa.Array, name: Path | str, field: str, tail: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Values (N, n_c, *tail) of lists, NaN behind shorter ones and where a row is null, and how many contacts a row has.
+    """Values (N, n_c, *tail) of lists, NaN behind shorter ones, and how many contacts a row has.
 
-    A row that is null has as many contacts as the largest one.
+    A row that is null is NaN, and has as many contacts as the largest one.
     """
     wanted = "a list of contacts" + "".join(f", {size} each" for size in tail)
     if not _is_list(array.type):
@@ -199,7 +199,7 @@ def _whole(column: pa.ChunkedArray) -> pa.Array:
 
 
 def _lists(values: np.ndarray) -> pa.Array:
-    """Rows of an array as lists; what has no further axis is plain, and the first axis behind rows has no fixed size."""
+    """Rows of an array as lists, of which the outermost has no fixed size."""
     array = pa.array(np.ascontiguousarray(values).ravel())
     for size in reversed(values.shape[2:]):
         array = pa.FixedSizeListArray.from_arrays(array, size)

@@ -1,20 +1,18 @@
 """The ranking of many candidates by their robustness margin, with the tightening forces of the best."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxgrasp.candidates import Candidates
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.metrics import METRICS
+from jaxgrasp.ranking.order import certain, least_of_best, order_of
 from jaxgrasp.ranking.scores import check_metrics
-from jaxgrasp.ranking.tiles import columns_of, margins, solve_in_tiles, tightening
+from jaxgrasp.ranking.tiles import Columns, columns_of, margins, solve_in_tiles, tightening
 from jaxgrasp.solvers.status import Status
-
-_ANSWERED = (Status.SOLVED, Status.UNBOUNDED)
-_LAST = {Status.INFEASIBLE: 2, Status.INVALID_INPUT: 3, Status.NOT_VERIFIED: 4}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,15 +143,61 @@ def rank(
             if progress is not None:
                 progress(scores.done)
         order = scores.order()
-        best = order[:top]
-        columns = {name: column[best] for name, column in columns.items()} | {"wanted": share * scores.bearable(best)}
-        for _, answer in solve_in_tiles(tightening, columns, disturbances, **settings):
+        for answer in _tightened(scores, columns, order[:top], share, disturbances, settings):
             answers.append(answer)
             if progress is not None:
                 progress(scores.done)
     except (KeyboardInterrupt, RuntimeError, MemoryError) as reason:
         raise RankingInterrupted(scores.ranking(candidates, scores.order(), share, answers)) from reason
     return scores.ranking(candidates, order, share, answers)
+
+
+def tighten(
+    candidates: Candidates,
+    margin: Float[np.ndarray, " batch"],
+    upper_bound: Float[np.ndarray, " batch"],
+    status: Int[np.ndarray, " batch"],
+    disturbances: DisturbanceSet,
+    *,
+    gravity: float = 0.0,
+    cone_edges: int = 8,
+    share: float = 0.75,
+    metrics: Mapping[str, Float[np.ndarray, " batch"]] | None = None,
+) -> Ranking:
+    """Ranks candidates whose margins are known, and finds the tightening forces (22) of all of them.
+
+    Args:
+        candidates: What to rank.
+        margin: lambda of (21), multiples of the disturbances.
+        upper_bound: A certified upper bound of it.
+        status: `Status` of (21).
+        disturbances: The set that the margins scale.
+        gravity: As for `rank`, like all that follow.
+        cone_edges: Edges of the friction pyramid.
+        share: The part of its margin for which the forces of a candidate are found.
+        metrics: Of all candidates; where there are any, the first ranks in place of the margin.
+    """
+    scores = _Scores(
+        margin=margin, upper_bound=upper_bound, status=status, metrics=dict(metrics or {}), done=len(margin)
+    )
+    order = scores.order()
+    settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None}
+    answers = list(_tightened(scores, columns_of(candidates), order, share, disturbances, settings))
+    return scores.ranking(candidates, order, share, answers)
+
+
+def _tightened(
+    scores: "_Scores",
+    columns: Columns,
+    best: np.ndarray,
+    share: float,
+    disturbances: DisturbanceSet,
+    settings: dict[str, Any],
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Answers of (22) for the best, tile by tile."""
+    columns = {name: column[best] for name, column in columns.items()} | {"wanted": share * scores.bearable(best)}
+    for _, answer in solve_in_tiles(tightening, columns, disturbances, **settings):
+        yield answer
 
 
 @dataclass(kw_only=True)
@@ -177,31 +221,18 @@ class _Scores:
         self.done = rows.stop
 
     def order(self) -> np.ndarray:
-        for name, value in self.metrics.items():
-            found = value[: self.done] if METRICS[name].larger_is_better else -value[: self.done]
-            return np.lexsort((np.where(np.isnan(found), 0.0, -found), np.isnan(found)))
-        margin, status = self.margin[: self.done], self.status[: self.done]
-        group = np.ones(self.done, dtype=int)
-        group[self.certain(slice(self.done))] = 0
-        for code, last in _LAST.items():
-            group[status == code] = last
-        return np.lexsort((np.where(np.isnan(margin), np.inf, -margin), group))  # stable: equals stay in order
+        known = slice(self.done)
+        metrics = {name: value[known] for name, value in self.metrics.items()}
+        return order_of(self.margin[known], self.status[known], metrics)
 
     def least_of_best(self, top: int) -> float:
         """What a candidate must reach to be among the best so far."""
-        best = self.margin[: self.done][self.certain(slice(self.done))]
-        return float(np.partition(best, len(best) - top)[len(best) - top]) if len(best) >= top else -np.inf
+        return least_of_best(self.margin[: self.done], self.status[: self.done], top)
 
     def bearable(self, rows: np.ndarray) -> np.ndarray:
         # An infinite margin says that nothing disturbs the grasp: what remains to be asked is that it bears its load.
         margin = np.where(self.status[rows] == Status.UNBOUNDED, 0.0, np.maximum(self.margin[rows], 0.0))
-        return np.where(self.certain(rows), margin, np.nan)
-
-    def certain(self, rows: slice | np.ndarray) -> np.ndarray:
-        """Which candidates have a margin that is certain; of those that are undecided it is a lower bound."""
-        status = self.status[rows]
-        undecided = (status == Status.MAX_ITERATIONS) & np.isfinite(self.margin[rows])
-        return np.isin(status, _ANSWERED) | undecided
+        return np.where(certain(self.margin[rows], self.status[rows]), margin, np.nan)
 
     def ranking(
         self, candidates: Candidates, order: np.ndarray, share: float, answers: list[tuple[np.ndarray, ...]]

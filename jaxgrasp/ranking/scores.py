@@ -37,6 +37,7 @@ def score(
     gravity: float = 0.0,
     cone_edges: int = 8,
     progress: Callable[[int], None] | None = None,
+    stream: bool = False,
 ) -> Float[np.ndarray, " batch"]:
     """One metric of all candidates.
 
@@ -47,6 +48,7 @@ def score(
         gravity: m/s^2 along the object's -z, for which the candidates' masses must be borne; of the margins alone.
         cone_edges: Edges of the friction pyramid.
         progress: Called with the number of candidates done.
+        stream: Whether other batches of other lengths follow, see `solve_in_tiles`.
 
     Returns:
         (N,), NaN where there is no answer.
@@ -59,7 +61,8 @@ def score(
     report = progress or (lambda _: None)
     columns, values = columns_of(candidates), np.empty(len(candidates))
     if METRICS[name].under_jit(disturbances):
-        settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None if name == "margin" else _TILE}
+        tile = None if name == "margin" else _TILE
+        settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": tile, "stream": stream}
         for rows, value in solve_in_tiles(_scorer(name, cone_edges), columns, disturbances, **settings):
             values[rows] = value + 0.0  # minus zero is zero
             report(rows.stop)

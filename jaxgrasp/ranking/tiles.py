@@ -16,6 +16,7 @@ from jaxgrasp.candidates import Candidates
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts, required_wrench
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.lanes.direct import power_of_two
 from jaxgrasp.robustness import largest_disturbance, least_effort
 
 # Candidates a tile: enough to keep each core busy for tens of milliseconds, few enough that a tile's arrays stay below
@@ -79,6 +80,7 @@ def solve_in_tiles(
     gravity: float,
     cone_edges: int,
     tile: int | None,
+    stream: bool = False,
 ) -> Iterator[tuple[slice, Any]]:
     """Runs a solver over all candidates, one tile after the other with one compilation.
 
@@ -89,6 +91,8 @@ def solve_in_tiles(
         gravity: Along the object's -z, m/s^2; zero means that no weight but that of `required_wrench` need be borne.
         cone_edges: Edges of the friction pyramid.
         tile: Candidates at a time, at most; None chooses by platform.
+        stream: Whether other batches follow, of other lengths: then tiles are of few sizes, so that few programs serve
+            all of them.
 
     Yields:
         The rows of each tile and the solver's answer for them, in NumPy.
@@ -99,6 +103,8 @@ def solve_in_tiles(
     # Tiles of equal size waste less than a last one that is mostly padding.
     tiles = max(1, math.ceil(count / tile))
     size = math.ceil(count / tiles / mesh.size) * mesh.size
+    if stream:
+        size = math.ceil(min(tile, power_of_two(count, _FEW)) / mesh.size) * mesh.size
     for start in range(0, count, max(size, 1)):
         stop = min(start + size, count)
         padded = {name: _padded(column[start:stop], size) for name, column in columns.items()}
