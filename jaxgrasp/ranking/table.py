@@ -3,6 +3,7 @@
 import itertools
 import zipfile
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -95,17 +96,36 @@ def write_table(ranking: Ranking, path: Path | str) -> None:
         _WRITERS[path.suffix](ranking, stream)
 
 
+def top_table(ranking: Ranking, travelling: pa.Table) -> pa.Table:
+    """The table of a ranking as Arrow's.
+
+    Args:
+        ranking: The ranking; its candidates' own columns are passed over.
+        travelling: These in Arrow, in the candidates' order: Arrow has more kinds of them.
+    """
+    bare = replace(ranking, candidates=replace(ranking.candidates, columns={}))
+    found = _arrow(_columns(bare, slice(None)).items(), _names(ranking))
+    for name, column in zip(travelling.column_names, travelling.columns, strict=True):
+        own = name in found.column_names or name.startswith("forces_")
+        found = found.append_column(f"input_{name}" if own else name, column.take(pa.array(ranking.order)))
+    return found
+
+
 def _write_parquet(ranking: Ranking, stream: BinaryIO) -> None:
     names = _names(ranking)
     pieces = (_arrow(piece.items(), names) for piece in _pieces(ranking))
     first = next(pieces)
-    # Numbers hardly ever repeat: a dictionary of them would be given up after it was made.
-    texts = [field.name for field in first.schema if not pa.types.is_floating(field.type)]
-    # Its annotation says bool, its documentation "bool or list".
-    texts = cast(bool, texts)
-    with parquet.ParquetWriter(stream, first.schema, compression="zstd", use_dictionary=texts) as writer:
+    with parquet_writer(stream, first.schema) as writer:
         for piece in itertools.chain([first], pieces):
             writer.write_table(piece)
+
+
+def parquet_writer(stream: BinaryIO, schema: pa.Schema) -> parquet.ParquetWriter:
+    """What writes tables of candidates to a stream as Parquet."""
+    # Numbers hardly ever repeat: a dictionary of them would be given up after it was made.
+    texts = [field.name for field in schema if not pa.types.is_floating(field.type)]
+    # Its annotation says bool, its documentation "bool or list".
+    return parquet.ParquetWriter(stream, schema, compression="zstd", use_dictionary=cast(bool, texts))
 
 
 def _write_csv(ranking: Ranking, stream: BinaryIO) -> None:
@@ -140,13 +160,14 @@ def _arrow(columns: Iterable[tuple[str, np.ndarray]], names: dict[str, np.ndarra
     arrays = {
         name: pa.DictionaryArray.from_arrays(pa.array(column.astype(np.int32)), pa.array(names[name]))
         if name in names
-        else _arrow_column(name, column)
+        else arrow_column(name, column)
         for name, column in columns
     }
     return pa.table(arrays)
 
 
-def _arrow_column(name: str, column: np.ndarray) -> pa.Array:
+def arrow_column(name: str, column: np.ndarray) -> pa.Array:
+    """A column of the table as Arrow's: arrays per candidate are lists of fixed size."""
     # Null is only what this table has no answer for; a margin or a travelling number that is NaN stays NaN.
     if name == "effort" or (name.startswith("forces_") and column.ndim == 1):
         return pa.array(column, mask=np.isnan(column))

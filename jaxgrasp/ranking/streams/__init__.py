@@ -1,0 +1,1 @@
+"""Rankings of any number of candidates: part by part, in bounded memory."""

@@ -1,0 +1,152 @@
+"""The folder of a run: a manifest that says what is ranked and how, and parts that are whole or not there.
+
+manifest.json        inputs with sizes and digests, options, version
+parts/part-*.parquet a row a candidate, in the order of the inputs
+summaries/*.arrow    of each part: a sketch of the margins, and its best candidates
+top.parquet          the best with their forces
+"""
+
+import json
+import secrets
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import ipc, parquet
+
+from jaxgrasp.ranking.streams.scored import Summary
+from jaxgrasp.ranking.streams.sources import Source
+from jaxgrasp.ranking.table import parquet_writer
+from jaxgrasp.storage import FileError, atomic_write, open_regular
+
+MANIFEST = "manifest.json"
+_FORMAT = 1
+# Where a reader of the file finds which run and which part it is of.
+_KEY = b"jaxgrasp"
+_OF_SOURCES = ("path", "rows", "size", "digest")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What a run ranks, and how."""
+
+    version: str
+    """Of the package."""
+    run: str
+    """The run's own name, which its parts have, too."""
+    options: dict[str, Any]
+    """What was asked, by the options' names; values are JSON's."""
+    inputs: list[dict[str, Any]]
+    """Name, path, number of candidates, size and digest of every file."""
+
+    @classmethod
+    def new(cls, version: str, options: dict[str, Any], sources: Sequence[Source]) -> "Manifest":
+        """The manifest of a run that begins."""
+        return cls(version=version, run=secrets.token_hex(8), options=options, inputs=_inputs(sources))
+
+    @classmethod
+    def read(cls, folder: Path) -> "Manifest":
+        """Reads that of a folder.
+
+        Raises:
+            FileError: There is none, or it is no manifest.
+        """
+        path = folder / MANIFEST
+        with open_regular(path, "the manifest of a run (jaxgrasp rank --run)") as stream:
+            content = stream.read()
+        try:
+            found = json.loads(content)
+            if found.pop("format") != _FORMAT:
+                raise ValueError("another format")
+            return cls(**found)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise FileError(path, None, f"no manifest ({type(error).__name__})", "that of a run") from error
+
+    def write(self, folder: Path) -> None:
+        """Writes it into a folder.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        with atomic_write(folder / MANIFEST) as stream:
+            stream.write(json.dumps({"format": _FORMAT, **asdict(self)}, indent=1).encode())
+
+    def difference(self, version: str, options: dict[str, Any], sources: Sequence[Source]) -> str:
+        """What is not as it was when the run began, in words; empty where all is.
+
+        Args:
+            version: Of the package.
+            options: What is asked now.
+            sources: The files as they are now.
+        """
+        if version != self.version:
+            return f"version: got jaxgrasp {version}; the run was begun by {self.version}"
+        for name, value in self.options.items():
+            if options.get(name) != value:
+                return f"--{name.replace('_', '-')}: got {options.get(name)}; the run has {value}"
+        now = _inputs(sources)
+        for before, after in zip(self.inputs, now, strict=False):
+            for key in _OF_SOURCES:
+                if before[key] != after[key]:
+                    what = "another file" if key == "path" else f"a file that has changed ({key})"
+                    return f"{after['name']}: got {what}; the run has {before['name']}, {before['rows']:,} candidates"
+        if len(now) != len(self.inputs):
+            return f"inputs: got {len(now):,} files; the run has {len(self.inputs):,}"
+        return ""
+
+
+class Parts:
+    """The parts of a run on the disk."""
+
+    def __init__(self, folder: Path, run: str):
+        """Takes the folder, and the run's own name."""
+        self._folder, self._run = folder, run
+
+    def path(self, number: int) -> Path:
+        """Where a part's rows are."""
+        return self._folder / "parts" / f"part-{number:06d}.parquet"
+
+    def write(self, number: int, table: pa.Table, summary: Summary, skipped: Sequence[str]) -> None:
+        """Writes a part: its summary first, so that who finds the rows finds both.
+
+        Args:
+            number: Of the part.
+            table: Its rows, those that could be read.
+            summary: Its summary.
+            skipped: What could not be read.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        for path in (self.path(number), self._summary(number)):
+            path.parent.mkdir(exist_ok=True)
+        best = summary.to_table()
+        with atomic_write(self._summary(number)) as stream, ipc.new_file(stream, best.schema) as writer:
+            writer.write_table(best)
+        about = {"run": self._run, "part": number, "rows": table.num_rows, "skipped": list(skipped)}
+        table = table.replace_schema_metadata({_KEY: json.dumps(about)})
+        with atomic_write(self.path(number)) as stream, parquet_writer(stream, table.schema) as writer:
+            writer.write_table(table)
+
+    def finished(self, number: int) -> tuple[Summary, list[str]] | None:
+        """The summary of a part that is there and whole, and what could not be read of it; None where it is not."""
+        try:
+            with open_regular(self.path(number), cost=0) as stream:
+                file = parquet.ParquetFile(stream)
+                about = json.loads(file.schema_arrow.metadata[_KEY])
+                rows = file.metadata.num_rows
+            if (about["run"], about["part"], about["rows"]) != (self._run, number, rows):
+                return None
+            with open_regular(self._summary(number)) as stream:
+                return Summary.from_table(ipc.open_file(stream).read_all()), about["skipped"]
+        except (FileError, pa.ArrowException, OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def _summary(self, number: int) -> Path:
+        return self._folder / "summaries" / f"part-{number:06d}.arrow"
+
+
+def _inputs(sources: Sequence[Source]) -> list[dict[str, Any]]:
+    return [{key: getattr(source, key) for key in ("name", *_OF_SOURCES)} for source in sources]
