@@ -12,6 +12,7 @@ from jaxgrasp.cli import signals
 from jaxgrasp.cli.checks import Skipped, check_options, check_output, conclude, warn_of_conventions, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
+from jaxgrasp.cli.rank_in_parts import GivenFiles, InParts, as_begun, rank_in_parts
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import notice, printing
@@ -36,8 +37,9 @@ class Rank(Reading):
     with --hand, --object and --grasps, the candidates are configurations of a hand.
     """
 
-    files: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Files of candidates; none for the built-in object."""
+    files: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Files of candidates, .npz, Parquet or Arrow, folders and patterns of these, or URLs such as s3://bucket/folder;
+    none for the built-in object."""
 
     friction: float | None = None
     """Coulomb's friction coefficient for files without any."""
@@ -76,6 +78,8 @@ class Rank(Reading):
     figure: Path | None = Path("ranking.png")
     """The figure to write, .png, .svg or .pdf; None for no figure."""
 
+    in_parts: Annotated[InParts, tyro.conf.arg(name="")] = field(default_factory=InParts)
+
     of_hand: Annotated[Scene, tyro.conf.arg(name="")] = field(default_factory=Scene)
 
     def run(self) -> int:
@@ -88,6 +92,9 @@ class Rank(Reading):
             CommandError: The options or the files cannot be used, or the work came to no good end: 130 after Ctrl-C, 1
                 after an error of the computation, 2 where a file could not be written in the end.
         """
+        return (as_begun(self) if self.in_parts.resume else self)._answer()
+
+    def _answer(self) -> int:
         names = metric_names(self.metric)
         self._check()
         configure_jax()
@@ -101,8 +108,14 @@ class Rank(Reading):
             disturbances, unit = named_disturbances(self.disturbances)
             if self.of_hand.given:
                 candidates, hands = self.of_hand.candidates(self.friction, self.max_force, skipped)
+            elif self.files:
+                given = GivenFiles.of(self, disturbances, names, skipped)
+                folder = given.folder(self)
+                if folder is not None:
+                    return rank_in_parts(self, folder, given, unit, clock)
+                candidates = given.candidates()
             else:
-                candidates = self._candidates()
+                candidates = self._sampled()
         except CandidateError as error:
             raise CommandError(str(error)) from error
         if not self.of_hand.given:
@@ -132,27 +145,24 @@ class Rank(Reading):
             option = "--scene" if self.of_hand.scene else "--hand"
             raise CommandError(f"{option}: got {what}, too; wanted the scene's own contacts and gravity alone")
         inputs = [
-            *self.files,
+            *map(Path, self.files),
             Path(self.disturbances),
             Path(self.of_hand.name),
             self.of_hand.qpos or Path(),
             *self.of_hand.grasps,
         ]
+        self.in_parts.check(self)
         for option, path, endings in (
-            ("--output", self.output, TABLE_ENDINGS),
-            ("--figure", self.figure, FIGURE_ENDINGS),
+            ("--output", None if self.in_parts.folder else self.output, TABLE_ENDINGS),
+            ("--figure", self.in_parts.figure(self.figure), FIGURE_ENDINGS),
             ("--picture", self.of_hand.picture if self.of_hand.given else None, FIGURE_ENDINGS),
         ):
             if path is not None:
                 check_output(path, option, endings, inputs)
 
-    def _candidates(self) -> "Candidates":
-        from jaxgrasp.candidates import read_candidates, sample_grasps
+    def _sampled(self) -> "Candidates":
+        from jaxgrasp.candidates import sample_grasps
 
-        if self.files:
-            return read_candidates(
-                self.files, friction=self.friction, max_force=self.max_force, with_mass=self.gravity != 0.0
-            )
         return sample_grasps(
             SAMPLED,
             friction=0.6 if self.friction is None else self.friction,
@@ -170,6 +180,7 @@ class Rank(Reading):
     ) -> None:
         from jaxgrasp.cli.report import print_ranking, progress_bar
         from jaxgrasp.ranking import RankingInterrupted, rank
+        from jaxgrasp.ranking.sketch import Sketch
 
         code, complaint = 0, ""
         try:
@@ -196,7 +207,7 @@ class Rank(Reading):
         written, unwritten = self._write(ranking, unit, hands)
         zeros = self._why_zero(ranking, disturbances)
         with printing():
-            print_ranking(ranking, unit, clock, zeros, written)
+            print_ranking(ranking, Sketch.of(ranking.margin, ranking.status), unit, clock, zeros, written)
         conclude(complaint, unwritten, code)
 
     def _why_zero(self, ranking: "Ranking", disturbances: "DisturbanceSet") -> list[str]:

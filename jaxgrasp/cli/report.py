@@ -15,6 +15,7 @@ from rich.table import Table
 
 from jaxgrasp.cli import signals
 from jaxgrasp.ranking import MetricComparison, Ranking
+from jaxgrasp.ranking.sketch import Sketch
 from jaxgrasp.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -231,11 +232,14 @@ def print_synthesis(
         console.print("written: " + ", ".join(map(str, written)), markup=False)
 
 
-def print_ranking(ranking: Ranking, unit: str, clock: Clock, why_zero: Sequence[str], written: Sequence[Path]) -> None:
+def print_ranking(
+    ranking: Ranking, sketch: Sketch, unit: str, clock: Clock, why_zero: Sequence[str], written: Sequence[Path]
+) -> None:
     """Prints a ranking to standard output.
 
     Args:
-        ranking: The ranking.
+        ranking: The ranking, or that of the best alone.
+        sketch: Of all candidates.
         unit: Unit of the margin.
         clock: How long it took.
         why_zero: Why margins are zero, of `ranking.why_zero`.
@@ -246,16 +250,16 @@ def print_ranking(ranking: Ranking, unit: str, clock: Clock, why_zero: Sequence[
     console = Console(width=None if sys.stdout.isatty() else width, highlight=False)
     rows = min(len(ranking.forces), _ROWS)
     if rows:
-        console.print(_table(ranking, rows, unit))
+        console.print(_table(ranking, sketch.count, rows, unit))
     if rows < len(ranking.forces):
         console.print(f"... and {len(ranking.forces) - rows} more with forces")
     unanswered = int((ranking.tightening_status != Status.SOLVED).sum())
     if unanswered:
         console.print(f"no tightening forces for {unanswered} of the best {len(ranking.forces)}")
-    console.print(_counts(ranking))
+    console.print(_counts(sketch))
     _print_zeros(console, "a margin of zero", why_zero)
     for name, value in list(ranking.metrics.items())[:1]:
-        if len(value) > 1 and (value == value[0]).all():
+        if len(value) == sketch.count > 1 and (value == value[0]).all():
             console.print(f"{name}: {value[0]:z.4g} for all, which leaves them in the order of the files", markup=False)
     console.print(str(clock))
     if written:
@@ -298,11 +302,11 @@ def _print_zeros(console: Console, what: str, why_zero: Sequence[str]) -> None:
         console.print(f"{what}: {'; '.join(why_zero)}", markup=False, soft_wrap=True)
 
 
-def _table(ranking: Ranking, rows: int, unit: str) -> Table:
+def _table(ranking: Ranking, count: int, rows: int, unit: str) -> Table:
     candidates = ranking.candidates
     texts = [name for name, column in candidates.columns.items() if column.dtype.kind == "U" and column.ndim == 1]
     by = f" by {next(iter(ranking.metrics))}" if ranking.metrics else ""
-    title = f"The best {rows} of {len(ranking.margin):,}{by}; forces for {ranking.share:.0%} of the margin"
+    title = f"The best {rows} of {count:,}{by}; forces for {ranking.share:.0%} of the margin"
     table = Table(title=title)
     texts = texts[:_TEXT_COLUMNS]
     others = [name for name in ranking.metrics if name != "margin"]
@@ -327,11 +331,9 @@ def _table(ranking: Ranking, rows: int, unit: str) -> Table:
     return table
 
 
-def _counts(ranking: Ranking) -> str:
-    counts = {status: int((ranking.status == status).sum()) for status in Status}
-    positive = int(((ranking.status == Status.SOLVED) & (ranking.margin > 1e-6)).sum())
-    parts = {status: f"{count:,} {status.name}" for status, count in counts.items()}
-    parts[Status.SOLVED] += f" ({positive:,} with a margin above zero)"
-    if counts[Status.MAX_ITERATIONS]:
+def _counts(sketch: Sketch) -> str:
+    parts = {status: f"{sketch.statuses[status]:,} {status.name}" for status in Status}
+    parts[Status.SOLVED] += f" ({sketch.positive:,} with a margin above zero)"
+    if sketch.statuses[Status.MAX_ITERATIONS]:
         parts[Status.MAX_ITERATIONS] += " (undecided, their margins are lower bounds)"
     return ", ".join(parts.values())

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -14,13 +13,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxgrasp.ranking import Ranking
+from jaxgrasp.ranking.sketch import NOTHING, Sketch
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.storage import atomic_write
 from jaxgrasp.viewer.grasp import CONTACT_COLOURS, draw_grasp
 from jaxgrasp.viewer.held import Held
 
-# A margin below this, in multiples of the disturbance set, is drawn as none: the solver's own tolerance.
-_NOTHING = 1e-6
 _SURFACE_POINTS = 1500
 
 
@@ -31,6 +29,7 @@ def figure_of_ranking(
     loaded: bool = False,
     grasps: int = 4,
     held: Callable[[int], Held] | None = None,
+    sketch: Sketch | None = None,
 ) -> Figure:
     """Draws the distribution of the margins and the best grasps with their tightening forces.
 
@@ -44,6 +43,7 @@ def figure_of_ranking(
         grasps: How many of the best that have forces to draw, at most.
         held: The hand and the object of a candidate, by its number: they are then drawn around its contacts, and the
             hand's links are named.
+        sketch: The distribution of all margins where the ranking is of the best alone.
 
     Returns:
         The figure; `savefig` writes it.
@@ -51,10 +51,10 @@ def figure_of_ranking(
     shown = np.flatnonzero(np.isfinite(ranking.effort))[:grasps].tolist()
     figure = Figure(figsize=(13.0, 7.6) if shown else (5.0, 6.0), layout=ConstrainedLayoutEngine(hspace=0.06), dpi=150)
     if not shown:
-        _draw_distribution(figure.subplots(2, 1, height_ratios=(3, 1)), ranking, unit)
+        _draw_distribution(figure.subplots(2, 1, height_ratios=(3, 1)), ranking, unit, sketch)
         return figure
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.9), squeeze=False).flat
-    _draw_distribution(left.subplots(2, 1, height_ratios=(3, 1)), ranking, unit)
+    _draw_distribution(left.subplots(2, 1, height_ratios=(3, 1)), ranking, unit, sketch)
     columns = min(len(shown), 2)
     for number, place in enumerate(shown, start=1):
         # Added one by one: matplotlib cannot lay out a 3D panel that is there and not visible.
@@ -80,35 +80,41 @@ def write_figure(figure: Figure, path: Path | str) -> None:
         figure.savefig(stream, format=path.suffix.removeprefix("."))
 
 
-def _draw_distribution(axes: np.ndarray, ranking: Ranking, unit: str) -> None:
+def _draw_distribution(axes: np.ndarray, ranking: Ranking, unit: str, sketch: Sketch | None) -> None:
     histogram, counts = axes
-    outcomes = _outcomes(ranking)
-    positive = ranking.margin[outcomes["margin > 0"]]
+    if sketch is None:
+        positive = ranking.margin[(ranking.status == Status.SOLVED) & (ranking.margin > NOTHING)]
+        weights, median = np.ones(len(positive)), np.median(positive) if len(positive) else np.nan
+        sketch = Sketch.of(ranking.margin, ranking.status)
+    else:
+        filled = np.flatnonzero(sketch.margins)
+        positive, weights = np.sqrt(sketch.edges[filled] * sketch.edges[filled + 1]), sketch.margins[filled]
+        median = sketch.median
     if len(positive):
-        histogram.hist(positive, bins=min(60, max(10, int(len(positive) ** 0.5))), color="#4477aa", linewidth=0)
+        bins = min(60, max(10, int(sketch.positive**0.5)))
+        histogram.hist(positive, bins=bins, weights=weights, color="#4477aa", linewidth=0)
         best = ranking.margin[ranking.order[: len(ranking.forces)]]
         best = best[np.isfinite(best)]
         if len(best):
             label = "the best one" if len(best) == 1 else f"the best {len(best)}"
             histogram.plot(best, np.zeros(len(best)), "|", color="#cc3311", markersize=14, label=label)
-        histogram.axvline(np.median(positive), color="0.2", linewidth=1.0, linestyle="--", label="median")
+        histogram.axvline(median, color="0.2", linewidth=1.0, linestyle="--", label="median")
         histogram.legend(frameon=False, fontsize=8)
         histogram.set_xlim(left=0.0)
     else:
         histogram.text(0.5, 0.5, "no candidate resists\nevery disturbance", ha="center", transform=histogram.transAxes)
     histogram.set(xlabel=f"robustness margin $\\lambda$ [{unit}]", ylabel="candidates")
     histogram.set_title("Candidates with a positive margin", fontsize=10)
-    _draw_counts(counts, {name: int(mask.sum()) for name, mask in outcomes.items() if mask.any()})
+    _draw_counts(counts, {name: count for name, count in _outcomes(sketch).items() if count})
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
 
 
-def _outcomes(ranking: Ranking) -> dict[str, Bool[np.ndarray, " batch"]]:
-    solved = ranking.status == Status.SOLVED
-    positive = ranking.margin > _NOTHING
-    outcomes = {"margin > 0": solved & positive, "margin 0": solved & ~positive}
+def _outcomes(sketch: Sketch) -> dict[str, int]:
+    solved = int(sketch.statuses[Status.SOLVED])
+    outcomes = {"margin > 0": sketch.positive, "margin 0": solved - sketch.positive}
     others = [status for status in Status if status != Status.SOLVED]
-    return outcomes | {status.name.lower().replace("_", " "): ranking.status == status for status in others}
+    return outcomes | {status.name.lower().replace("_", " "): int(sketch.statuses[status]) for status in others}
 
 
 def _draw_counts(axes: Axes, counts: dict[str, int]) -> None:

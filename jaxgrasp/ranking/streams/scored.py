@@ -85,7 +85,12 @@ class Scored:
 
     def best(self, top: int) -> "Scored":
         """Returns the best `top`, the best first; equals in the order of their files and rows."""
-        return self.take(best_of(self.margin, self.status, self.metrics, top))
+        found = self.take(best_of(self.margin, self.status, self.metrics, top))
+        # Of thousands of files no more are named than these are from.
+        names = _names(found.candidates).tolist()
+        sources = tuple(dict.fromkeys(names))
+        source = np.array([sources.index(name) for name in names], dtype=np.int32)
+        return replace(found, candidates=replace(found.candidates, sources=sources, source=source))
 
 
 def scored(
@@ -245,4 +250,5 @@ def _cutoff(best: np.ndarray, top: int) -> float:
 
 
 def _names(candidates: Candidates) -> np.ndarray:
-    return np.array(candidates.sources)[candidates.source]
+    """The file of each candidate."""
+    return np.array(candidates.sources, dtype=str)[candidates.source]

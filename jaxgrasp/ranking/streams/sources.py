@@ -304,6 +304,12 @@ def _width(kind: pa.DataType) -> int:
         return 32
 
 
+def digest_of(path: Path | str) -> str:
+    """Tells a file from others, as `Source.digest` does."""
+    with opened(str(path)) as stream:
+        return _digest(stream, stream.seek(0, 2))
+
+
 def absolute(path: Path | str) -> str:
     """A path that means the same in other folders; URLs as they are."""
     return str(path) if is_url(str(path)) else str(Path(path).absolute())

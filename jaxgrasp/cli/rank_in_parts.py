@@ -1,0 +1,330 @@
+"""`jaxgrasp rank` of more candidates than one table is for: part by part into a folder, and on from there."""
+
+import importlib.metadata
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from jaxgrasp.cli import signals
+from jaxgrasp.cli.checks import Skipped, check_options, conclude, write_files
+from jaxgrasp.cli.errors import CommandError
+from jaxgrasp.cli.streams import notice, printing
+from jaxgrasp.storage import allowance, made_folder, reason_of
+
+if TYPE_CHECKING:
+    from jaxgrasp.candidates import Candidates
+    from jaxgrasp.cli.rank import Rank
+    from jaxgrasp.cli.report import Clock
+    from jaxgrasp.disturbance import DisturbanceSet
+    from jaxgrasp.ranking.streams.folder import Manifest
+    from jaxgrasp.ranking.streams.run import Job
+    from jaxgrasp.ranking.streams.scored import Setting
+    from jaxgrasp.ranking.streams.sources import Source
+
+    R = TypeVar("R", bound=Rank)
+
+MOST_IN_A_TABLE = 2_000_000
+"""Of more candidates the result is a folder."""
+_OUTPUT, _FIGURE = Path("ranking.parquet"), Path("ranking.png")
+# Options that a run has from its beginning on.
+_OPTIONS = ("friction", "max_force", "gravity", "disturbances", "cone_edges", "share", "top", "prune", "metric")
+# The part that is read, that which is solved and that which is written are in memory at once, and copies of each.
+_SHARES = 8
+_TOLD = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class InParts:
+    """How more candidates than memory holds are ranked."""
+
+    run: Path | None = None
+    """A new folder to rank into part by part, in bounded memory: tables of all candidates in the order of the files,
+    the best with their forces, and the figure. More than 2,000,000 candidates always get one, named like --output."""
+
+    resume: Path | None = None
+    """The folder of a run that was interrupted, to go on with; files and options are those that it began with."""
+
+    sorted: bool = False
+    """With a folder: write all candidates once more, the best first."""
+
+    part_size: int = 131_072
+    """With a folder: candidates a part, at most."""
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder that is named."""
+        return self.run or self.resume
+
+    def check(self, command: "Rank") -> None:
+        """Finds what cannot be used before any long work.
+
+        Raises:
+            CommandError: An option cannot be used.
+        """
+        check_options(("--part-size", self.part_size, self.part_size >= 1, "at least 1"))
+        if self.folder is None:
+            return
+        option = "--run" if self.run else "--resume"
+        if self.run and self.resume:
+            raise CommandError("--run: got --resume, too; wanted one of them")
+        if command.of_hand.given or not command.files:
+            raise CommandError(f"{option}: got no files of candidates; wanted some, and no hand")
+        if command.output not in (_OUTPUT, None):
+            raise CommandError(f"{option}: got --output, too; wanted a folder alone")
+
+    def figure(self, figure: Path | None) -> Path | None:
+        """The figure to write outside the folder."""
+        return None if self.folder is not None and figure == _FIGURE else figure
+
+
+class GivenFiles:
+    """The files on the command line, by what they declare."""
+
+    def __init__(self, setting: "Setting", sources: "Sequence[Source]", skipped: Skipped, keep_going: bool):
+        """Takes what is asked, the files, and who is told of those that are passed over."""
+        self.setting, self.sources, self.skipped, self.keep_going = setting, tuple(sources), skipped, keep_going
+        self.rows = sum(source.rows for source in sources)
+
+    @classmethod
+    def of(
+        cls, command: "Rank", disturbances: "DisturbanceSet", names: Sequence[str], skipped: Skipped
+    ) -> "GivenFiles":
+        """Looks at the files of a command.
+
+        Raises:
+            FileError: One cannot be used.
+        """
+        from jaxgrasp.cli.report import counting_bar
+        from jaxgrasp.ranking.streams.inputs import names_of, sources_of
+        from jaxgrasp.ranking.streams.scored import Setting
+
+        own = {name: getattr(command, name) for name in _OPTIONS if name not in ("disturbances", "metric")}
+        setting = Setting(disturbances=disturbances, metrics=tuple(names), **own)
+        going = command.of_hand.keep_going
+        files = names_of(command.files)
+        with counting_bar("looking at files", len(files)) as progress:
+            sources = sources_of(files, setting.given, skipped if going else None, progress)
+        if not sources:
+            raise CommandError(f"{', '.join(command.files)}: none of {len(files):,} files can be used")
+        return cls(setting, sources, skipped, going)
+
+    def folder(self, command: "Rank") -> Path | None:
+        """The folder that the ranking goes to; None where it is a table.
+
+        Raises:
+            CommandError: There must be one, and none is named.
+        """
+        named = command.in_parts.folder
+        if named is not None or self.rows <= MOST_IN_A_TABLE:
+            return named
+        if command.output is None:
+            raise CommandError(
+                f"{', '.join(command.files)}: got {self.rows:,} candidates; wanted --run FOLDER for more than "
+                f"{MOST_IN_A_TABLE:,}"
+            )
+        folder = command.output.with_suffix("")
+        notice(f"{self.rows:,} candidates: the result is a folder, {folder}")
+        return folder
+
+    def candidates(self) -> "Candidates":
+        """All of them, in memory.
+
+        Raises:
+            FileError: A file cannot be used.
+        """
+        from jaxgrasp.candidates import read_candidates
+        from jaxgrasp.candidates.arrow import columns_of_table
+        from jaxgrasp.ranking.streams.plan import PartReader, parts_of, schema_of
+        from jaxgrasp.ranking.streams.sources import is_url
+
+        if not self.keep_going and all(s.kind == "npz" and not is_url(s.path) for s in self.sources):
+            return read_candidates([source.name for source in self.sources], **vars(self.setting.given))
+        size = sum(source.rows * source.row_size for source in self.sources)
+        if size > allowance():
+            raise CommandError(f"{self.rows:,} candidates: take {size / 2**30:.3g} GiB; wanted --run FOLDER")
+        schema = schema_of(self.sources)
+        reader = PartReader(self.sources, schema, self.setting.given)
+        (everything,) = parts_of(self.sources, self.rows, size)
+        found = reader.read(everything, self.skipped if self.keep_going else None)
+        reader.close()
+        if found is None:
+            raise CommandError("none of the files can be read")
+        candidates, travelling = found
+        columns = columns_of_table(travelling)
+        left_out = [name for name in travelling.column_names if name not in columns]
+        if left_out:
+            notice(f"columns that are no numbers, truth values or text are left out: {', '.join(left_out)}")
+        return replace(candidates, columns=columns)
+
+
+def as_begun(command: "R") -> "R":
+    """The command with the files and options that the run of --resume began with, where it has none of its own.
+
+    Raises:
+        CommandError: The folder has no run.
+    """
+    from jaxgrasp.ranking.streams.folder import Manifest
+    from jaxgrasp.storage import FileError
+
+    assert command.in_parts.resume is not None
+    try:
+        manifest = Manifest.read(command.in_parts.resume)
+    except FileError as error:
+        raise CommandError(f"--resume: {error}") from error
+    plain = {field.name: field.default for field in fields(command)}
+    own = {
+        name: manifest.options[name]
+        for name in _OPTIONS
+        if name in manifest.options and getattr(command, name) == plain[name]
+    }
+    if "metric" in own:
+        own["metric"] = tuple(own["metric"])
+    in_parts = command.in_parts
+    if in_parts.part_size == InParts.part_size:
+        in_parts = replace(in_parts, part_size=manifest.options.get("part_size", in_parts.part_size))
+    files = command.files or tuple(str(given["path"]) for given in manifest.inputs)
+    return replace(command, files=files, in_parts=in_parts, **own)
+
+
+def rank_in_parts(command: "Rank", folder: Path, given: GivenFiles, unit: str, clock: "Clock") -> int:
+    """Ranks into a folder, and prints.
+
+    Args:
+        command: The options.
+        folder: Where to.
+        given: The files.
+        unit: Unit of the margin.
+        clock: Runs since the files were looked at.
+
+    Returns:
+        The exit code: 0, or 2 where a file was passed over.
+
+    Raises:
+        CommandError: The folder cannot be used, or the work came to no good end.
+    """
+    from jaxgrasp.ranking.streams.run import held
+
+    try:
+        with made_folder(folder):
+            if command.in_parts.resume is None and any(folder.iterdir()):
+                got = "the folder of a run" if (folder / "manifest.json").exists() else "a folder with files in it"
+                raise CommandError(f"{folder}: got {got}; wanted a new one, or --resume {folder}")
+            with held(folder):
+                job = _job(command, folder, given)
+                _rank(command, job, given, unit, clock)
+    except (OSError, ValueError) as error:
+        hint = f"; jaxgrasp rank --resume {folder} goes on" if (folder / "manifest.json").exists() else ""
+        what = "cannot be used" if isinstance(error, BlockingIOError) else "cannot be written"
+        line = f"{folder}: {what} ({reason_of(error)})" if isinstance(error, OSError) else str(error)
+        raise CommandError(line + hint) from error
+    return given.skipped.exit_code()
+
+
+def _job(command: "Rank", folder: Path, given: GivenFiles) -> "Job":
+    """What is to be done: a new run, or one that goes on.
+
+    Raises:
+        CommandError: The run began with other options or files.
+    """
+    from jaxgrasp.ranking.streams.folder import Manifest
+    from jaxgrasp.ranking.streams.run import Job
+    from jaxgrasp.ranking.streams.sources import absolute, digest_of
+
+    version = _version()
+    options: dict[str, Any] = {name: getattr(command, name) for name in _OPTIONS}
+    options |= {"metric": list(given.setting.metrics), "part_size": command.in_parts.part_size}
+    if Path(command.disturbances).is_file():
+        options |= {"disturbances": absolute(command.disturbances), "wrenches": digest_of(command.disturbances)}
+    if command.in_parts.resume is None:
+        manifest = Manifest.new(version, options | {"part_bytes": allowance() // _SHARES}, given.sources)
+        manifest.write(folder)
+        signals.note_written(folder / "manifest.json")
+    else:
+        manifest = Manifest.read(folder)
+        difference = manifest.difference(
+            version, options | {"part_bytes": manifest.options["part_bytes"]}, given.sources
+        )
+        if difference:
+            raise CommandError(f"--resume {folder}: {difference}; wanted the same, or a new folder by --run")
+    return Job(
+        folder=folder,
+        run=manifest.run,
+        sources=_named_as_begun(given.sources, manifest),
+        setting=given.setting,
+        part_rows=manifest.options["part_size"],
+        part_size=manifest.options["part_bytes"],
+        keep_going=given.keep_going,
+    )
+
+
+def _rank(command: "Rank", job: "Job", given: GivenFiles, unit: str, clock: "Clock") -> None:
+    from jaxgrasp.cli.report import print_ranking, progress_bar
+    from jaxgrasp.ranking.streams.run import run_job, write_top
+    from jaxgrasp.viewer import figure_of_ranking, write_figure
+
+    look = _Conventions()
+    clock.lap()
+    try:
+        with progress_bar(job.rows, clock) as progress:
+            summary = run_job(job, skipped=given.skipped, progress=progress, look=look)
+    except KeyboardInterrupt as reason:
+        done = clock.ticks[-1][1] if clock.ticks else 0
+        line = f"{signals.word()}: ranked {done:,} of {job.rows:,}; jaxgrasp rank --resume {_shown(command)} goes on"
+        raise CommandError(line, 130) from reason
+    except (RuntimeError, MemoryError) as reason:
+        line = f"{str(reason) or type(reason).__name__}; jaxgrasp rank --resume {_shown(command)} goes on"
+        raise CommandError(" ".join(line.split()), 1) from reason
+    look.tell()
+    clock.lap()
+    ranking, path = write_top(job, summary)
+    written, folder = [path], job.folder
+    figure = folder / _FIGURE if command.figure == _FIGURE else command.figure
+    drawn, unwritten = write_files(
+        (
+            figure,
+            lambda path: write_figure(
+                figure_of_ranking(ranking, unit=unit, loaded=bool(command.gravity), sketch=summary.sketch), path
+            ),
+        ),
+    )
+    missing = job.rows - summary.sketch.count
+    if missing:
+        notice(f"{missing:,} of {job.rows:,} candidates could not be read")
+    with printing():
+        print_ranking(ranking, summary.sketch, unit, clock, (), [folder / "parts", *written, *drawn])
+    conclude("", unwritten)
+
+
+class _Conventions:
+    """Looks for units and directions that can hardly be meant in every part, and tells of a few files."""
+
+    def __init__(self) -> None:
+        self._doubts: dict[str, None] = {}
+
+    def __call__(self, candidates: "Candidates") -> None:
+        from jaxgrasp.candidates import doubtful_conventions
+
+        self._doubts |= dict.fromkeys(doubtful_conventions(candidates))
+
+    def tell(self) -> None:
+        lines = list(self._doubts)
+        if lines:
+            more = f" | and {len(lines) - _TOLD:,} more" if len(lines) > _TOLD else ""
+            notice(f"warning: {' | '.join(lines[:_TOLD])}{more}")
+
+
+def _named_as_begun(sources: "Sequence[Source]", manifest: "Manifest") -> "tuple[Source, ...]":
+    """The files by the names that the run's tables have already."""
+    return tuple(replace(source, name=before["name"]) for source, before in zip(sources, manifest.inputs, strict=True))
+
+
+def _shown(command: "Rank") -> Path | str:
+    return command.in_parts.folder or (command.output or _OUTPUT).with_suffix("")
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("jaxgrasp")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
