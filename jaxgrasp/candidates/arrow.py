@@ -149,16 +149,16 @@ def _dense(array: pa.Array, name: Path | str, field: str, tail: tuple[int, ...])
     if not _is_list(array.type):
         raise CandidateError(name, field, f"the type {array.type}", wanted)
     valid = np.asarray(array.is_valid())
-    lengths = pc.list_value_length(array).fill_null(0).to_numpy(zero_copy_only=False).astype(np.int64)
+    lengths = _lengths(array)
     declared = array.type.list_size if pa.types.is_fixed_size_list(array.type) else 0
     largest = int(max(lengths.max(initial=declared), 1))
     flat = array.flatten()
     for size in tail:
         if not _is_list(flat.type):
             raise CandidateError(name, field, f"the type {array.type}", wanted)
-        inside = pc.min_max(pc.list_value_length(flat)).as_py()
-        if flat.null_count or (len(flat) and (inside["min"] != size or inside["max"] != size)):
-            raise CandidateError(name, field, f"lists of {inside['min']} to {inside['max']}", wanted)
+        inside = _lengths(flat)
+        if (inside != size).any():
+            raise CandidateError(name, field, f"lists of {inside.min()} to {inside.max()}", wanted)
         flat = flat.flatten()
     if not _is_number(flat.type):
         raise CandidateError(name, field, f"the type {array.type}", wanted)
@@ -168,6 +168,12 @@ def _dense(array: pa.Array, name: Path | str, field: str, tail: tuple[int, ...])
     dense = np.full((len(lengths), largest, *tail), np.nan)
     dense[valid[:, None] & (np.arange(largest) < lengths[:, None])] = values
     return dense, np.where(valid, lengths, largest)
+
+
+def _lengths(array: pa.Array) -> np.ndarray:
+    """How long each list is; 0 where it is null."""
+    lengths = pc.call_function("list_value_length", [array])
+    return lengths.fill_null(0).to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 def _plain(array: pa.Array, name: Path | str, field: str) -> np.ndarray:

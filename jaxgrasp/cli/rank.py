@@ -1,20 +1,19 @@
 """`jaxgrasp rank`: files of candidates in, a table and a figure out."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-import tyro
 
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.checks import Skipped, check_options, check_output, conclude, warn_of_conventions, write_files
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
-from jaxgrasp.cli.rank_in_parts import GivenFiles, InParts, as_begun, rank_in_parts
-from jaxgrasp.cli.scene import Scene
-from jaxgrasp.cli.setting import FIGURE_ENDINGS, Reading, configure_jax, named_disturbances
+from jaxgrasp.cli.rank_in_parts import GivenFiles, as_begun, rank_in_parts
+from jaxgrasp.cli.rank_options import RankOptions
+from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import notice, printing
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ SAMPLED = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rank(Reading):
+class Rank(RankOptions):
     """Rank candidate grasps by the largest disturbance that they resist.
 
     Reads .npz files with positions (N, n_c, 3), in m about the centre of mass, and outward_normals (N, n_c, 3) or
@@ -36,51 +35,6 @@ class Rank(Reading):
     along into the table. Without a file it ranks 10,000 grasps that it samples on a built-in object. With --scene, or
     with --hand, --object and --grasps, the candidates are configurations of a hand.
     """
-
-    files: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Files of candidates, .npz, Parquet or Arrow, folders and patterns of these, or URLs such as s3://bucket/folder;
-    none for the built-in object."""
-
-    friction: float | None = None
-    """Coulomb's friction coefficient for files without any."""
-
-    max_force: float | None = None
-    """Largest normal force for files without any, N."""
-
-    gravity: float = 0.0
-    """Gravity along the object's -z, m/s^2, under which the mass of each candidate must be borne; 0 for none."""
-
-    disturbances: str = "forces"
-    """forces: 1 N along the six axes; ball: 1 N in any direction; box: 1 N along each axis together with 0.02 N m about
-    each; or a FILE of wrenches, .npy or .npz with the field wrenches (n_d, 6), N and N m. The margin is the factor by
-    which they may grow."""
-
-    cone_edges: int = 8
-    """Edges of the friction pyramid."""
-
-    share: float = 0.75
-    """The part of its margin for which the tightening forces of a grasp are found."""
-
-    top: int = 10
-    """How many of the best get tightening forces."""
-
-    prune: bool = False
-    """Give up grasps that cannot be among the best --top as soon as their bounds tell: the best are the same, sooner;
-    of the others the table has bounds."""
-
-    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Other metrics to have in the table, NAME[,NAME...]; the first one ranks. A wrong name is answered with all
-    names."""
-
-    output: Path | None = Path("ranking.parquet")
-    """The table to write, .parquet, .csv or .npz; None for no table."""
-
-    figure: Path | None = Path("ranking.png")
-    """The figure to write, .png, .svg or .pdf; None for no figure."""
-
-    in_parts: Annotated[InParts, tyro.conf.arg(name="")] = field(default_factory=InParts)
-
-    of_hand: Annotated[Scene, tyro.conf.arg(name="")] = field(default_factory=Scene)
 
     def run(self) -> int:
         """Ranks, writes and prints.

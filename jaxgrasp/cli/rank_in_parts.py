@@ -2,19 +2,19 @@
 
 import importlib.metadata
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import Skipped, check_options, conclude, write_files
+from jaxgrasp.cli.checks import Skipped, conclude, write_files
 from jaxgrasp.cli.errors import CommandError
+from jaxgrasp.cli.rank_options import FIGURE, OUTPUT, InParts, RankOptions
 from jaxgrasp.cli.streams import notice, printing
 from jaxgrasp.storage import allowance, made_folder, reason_of
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
-    from jaxgrasp.cli.rank import Rank
     from jaxgrasp.cli.report import Clock
     from jaxgrasp.disturbance import DisturbanceSet
     from jaxgrasp.ranking.streams.folder import Manifest
@@ -22,60 +22,15 @@ if TYPE_CHECKING:
     from jaxgrasp.ranking.streams.scored import Setting
     from jaxgrasp.ranking.streams.sources import Source
 
-    R = TypeVar("R", bound=Rank)
+R = TypeVar("R", bound=RankOptions)
 
 MOST_IN_A_TABLE = 2_000_000
 """Of more candidates the result is a folder."""
-_OUTPUT, _FIGURE = Path("ranking.parquet"), Path("ranking.png")
 # Options that a run has from its beginning on.
 _OPTIONS = ("friction", "max_force", "gravity", "disturbances", "cone_edges", "share", "top", "prune", "metric")
 # The part that is read, that which is solved and that which is written are in memory at once, and copies of each.
 _SHARES = 8
 _TOLD = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class InParts:
-    """How more candidates than memory holds are ranked."""
-
-    run: Path | None = None
-    """A new folder to rank into part by part, in bounded memory: tables of all candidates in the order of the files,
-    the best with their forces, and the figure. More than 2,000,000 candidates always get one, named like --output."""
-
-    resume: Path | None = None
-    """The folder of a run that was interrupted, to go on with; files and options are those that it began with."""
-
-    sorted: bool = False
-    """With a folder: write all candidates once more, the best first."""
-
-    part_size: int = 131_072
-    """With a folder: candidates a part, at most."""
-
-    @property
-    def folder(self) -> Path | None:
-        """The folder that is named."""
-        return self.run or self.resume
-
-    def check(self, command: "Rank") -> None:
-        """Finds what cannot be used before any long work.
-
-        Raises:
-            CommandError: An option cannot be used.
-        """
-        check_options(("--part-size", self.part_size, self.part_size >= 1, "at least 1"))
-        if self.folder is None:
-            return
-        option = "--run" if self.run else "--resume"
-        if self.run and self.resume:
-            raise CommandError("--run: got --resume, too; wanted one of them")
-        if command.of_hand.given or not command.files:
-            raise CommandError(f"{option}: got no files of candidates; wanted some, and no hand")
-        if command.output not in (_OUTPUT, None):
-            raise CommandError(f"{option}: got --output, too; wanted a folder alone")
-
-    def figure(self, figure: Path | None) -> Path | None:
-        """The figure to write outside the folder."""
-        return None if self.folder is not None and figure == _FIGURE else figure
 
 
 class GivenFiles:
@@ -88,7 +43,7 @@ class GivenFiles:
 
     @classmethod
     def of(
-        cls, command: "Rank", disturbances: "DisturbanceSet", names: Sequence[str], skipped: Skipped
+        cls, command: RankOptions, disturbances: "DisturbanceSet", names: Sequence[str], skipped: Skipped
     ) -> "GivenFiles":
         """Looks at the files of a command.
 
@@ -109,7 +64,7 @@ class GivenFiles:
             raise CommandError(f"{', '.join(command.files)}: none of {len(files):,} files can be used")
         return cls(setting, sources, skipped, going)
 
-    def folder(self, command: "Rank") -> Path | None:
+    def folder(self, command: RankOptions) -> Path | None:
         """The folder that the ranking goes to; None where it is a table.
 
         Raises:
@@ -158,7 +113,7 @@ class GivenFiles:
         return replace(candidates, columns=columns)
 
 
-def as_begun(command: "R") -> "R":
+def as_begun(command: R) -> R:
     """The command with the files and options that the run of --resume began with, where it has none of its own.
 
     Raises:
@@ -187,7 +142,7 @@ def as_begun(command: "R") -> "R":
     return replace(command, files=files, in_parts=in_parts, **own)
 
 
-def rank_in_parts(command: "Rank", folder: Path, given: GivenFiles, unit: str, clock: "Clock") -> int:
+def rank_in_parts(command: RankOptions, folder: Path, given: GivenFiles, unit: str, clock: "Clock") -> int:
     """Ranks into a folder, and prints.
 
     Args:
@@ -221,7 +176,7 @@ def rank_in_parts(command: "Rank", folder: Path, given: GivenFiles, unit: str, c
     return given.skipped.exit_code()
 
 
-def _job(command: "Rank", folder: Path, given: GivenFiles) -> "Job":
+def _job(command: RankOptions, folder: Path, given: GivenFiles) -> "Job":
     """What is to be done: a new run, or one that goes on.
 
     Raises:
@@ -258,9 +213,10 @@ def _job(command: "Rank", folder: Path, given: GivenFiles) -> "Job":
     )
 
 
-def _rank(command: "Rank", job: "Job", given: GivenFiles, unit: str, clock: "Clock") -> None:
-    from jaxgrasp.cli.report import print_ranking, progress_bar
+def _rank(command: RankOptions, job: "Job", given: GivenFiles, unit: str, clock: "Clock") -> None:
+    from jaxgrasp.cli.report import print_ranking, progress_bar, stoppable_bar
     from jaxgrasp.ranking.streams.run import run_job, write_top
+    from jaxgrasp.ranking.streams.sorting import write_sorted
     from jaxgrasp.viewer import figure_of_ranking, write_figure
 
     look = _Conventions()
@@ -279,7 +235,11 @@ def _rank(command: "Rank", job: "Job", given: GivenFiles, unit: str, clock: "Clo
     clock.lap()
     ranking, path = write_top(job, summary)
     written, folder = [path], job.folder
-    figure = folder / _FIGURE if command.figure == _FIGURE else command.figure
+    if command.in_parts.sorted:
+        with stoppable_bar("sorting", summary.sketch.count) as progress:
+            written.append(write_sorted(job, progress))
+        signals.note_written(written[-1])
+    figure = folder / FIGURE if command.figure == FIGURE else command.figure
     drawn, unwritten = write_files(
         (
             figure,
@@ -319,8 +279,8 @@ def _named_as_begun(sources: "Sequence[Source]", manifest: "Manifest") -> "tuple
     return tuple(replace(source, name=before["name"]) for source, before in zip(sources, manifest.inputs, strict=True))
 
 
-def _shown(command: "Rank") -> Path | str:
-    return command.in_parts.folder or (command.output or _OUTPUT).with_suffix("")
+def _shown(command: RankOptions) -> Path | str:
+    return command.in_parts.folder or (command.output or OUTPUT).with_suffix("")
 
 
 def _version() -> str:

@@ -1,0 +1,109 @@
+"""The options of `jaxgrasp rank`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxgrasp.cli.checks import check_options
+from jaxgrasp.cli.errors import CommandError
+from jaxgrasp.cli.scene import Scene
+from jaxgrasp.cli.setting import Reading
+
+OUTPUT, FIGURE = Path("ranking.parquet"), Path("ranking.png")
+"""What is written where nothing else is said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InParts:
+    """How more candidates than memory holds are ranked."""
+
+    run: Path | None = None
+    """A new folder to rank into part by part, in bounded memory: tables of all candidates in the order of the files,
+    the best with their forces, and the figure. More than 2,000,000 candidates always get one, named like --output."""
+
+    resume: Path | None = None
+    """The folder of a run that was interrupted, to go on with; files and options are those that it began with."""
+
+    sorted: bool = False
+    """With a folder: write all candidates once more, the best first."""
+
+    part_size: int = 131_072
+    """With a folder: candidates a part, at most."""
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder that is named."""
+        return self.run or self.resume
+
+    def check(self, command: "RankOptions") -> None:
+        """Finds what cannot be used before any long work.
+
+        Raises:
+            CommandError: An option cannot be used.
+        """
+        check_options(("--part-size", self.part_size, self.part_size >= 1, "at least 1"))
+        if self.folder is None:
+            return
+        option = "--run" if self.run else "--resume"
+        if self.run and self.resume:
+            raise CommandError("--run: got --resume, too; wanted one of them")
+        if command.of_hand.given or not command.files:
+            raise CommandError(f"{option}: got no files of candidates; wanted some, and no hand")
+        if command.output not in (OUTPUT, None):
+            raise CommandError(f"{option}: got --output, too; wanted a folder alone")
+
+    def figure(self, figure: Path | None) -> Path | None:
+        """The figure to write outside the folder."""
+        return None if self.folder is not None and figure == FIGURE else figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class RankOptions(Reading):
+    """What is ranked, and how."""
+
+    files: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Files of candidates, .npz, Parquet or Arrow, folders and patterns of these, or URLs such as s3://bucket/folder;
+    none for the built-in object."""
+
+    friction: float | None = None
+    """Coulomb's friction coefficient for files without any."""
+
+    max_force: float | None = None
+    """Largest normal force for files without any, N."""
+
+    gravity: float = 0.0
+    """Gravity along the object's -z, m/s^2, under which the mass of each candidate must be borne; 0 for none."""
+
+    disturbances: str = "forces"
+    """forces: 1 N along the six axes; ball: 1 N in any direction; box: 1 N along each axis together with 0.02 N m about
+    each; or a FILE of wrenches, .npy or .npz with the field wrenches (n_d, 6), N and N m. The margin is the factor by
+    which they may grow."""
+
+    cone_edges: int = 8
+    """Edges of the friction pyramid."""
+
+    share: float = 0.75
+    """The part of its margin for which the tightening forces of a grasp are found."""
+
+    top: int = 10
+    """How many of the best get tightening forces."""
+
+    prune: bool = False
+    """Give up grasps that cannot be among the best --top as soon as their bounds tell: the best are the same, sooner;
+    of the others the table has bounds."""
+
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Other metrics to have in the table, NAME[,NAME...]; the first one ranks. A wrong name is answered with all
+    names."""
+
+    output: Path | None = OUTPUT
+    """The table to write, .parquet, .csv or .npz; None for no table."""
+
+    figure: Path | None = FIGURE
+    """The figure to write, .png, .svg or .pdf; None for no figure."""
+
+    in_parts: Annotated[InParts, tyro.conf.arg(name="")] = field(default_factory=InParts)
+
+    of_hand: Annotated[Scene, tyro.conf.arg(name="")] = field(default_factory=Scene)
