@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.checks import Skipped, conclude, write_files
 from jaxgrasp.cli.errors import CommandError
+from jaxgrasp.cli.metrics import metric_names
 from jaxgrasp.cli.rank_options import FIGURE, OUTPUT, InParts, RankOptions
 from jaxgrasp.cli.streams import notice, printing
 from jaxgrasp.storage import allowance, made_folder, reason_of
@@ -139,7 +140,25 @@ def as_begun(command: R) -> R:
     if in_parts.part_size == InParts.part_size:
         in_parts = replace(in_parts, part_size=manifest.options.get("part_size", in_parts.part_size))
     files = command.files or tuple(str(given["path"]) for given in manifest.inputs)
-    return replace(command, files=files, in_parts=in_parts, **own)
+    found = replace(command, files=files, in_parts=in_parts, **own)
+    _refuse(command.in_parts.resume, manifest.other_options(_version(), _options(found)))
+    return found
+
+
+def _options(command: RankOptions) -> dict[str, Any]:
+    """What a run is asked, as its manifest has it."""
+    from jaxgrasp.ranking.streams.sources import absolute, digest_of
+
+    options: dict[str, Any] = {name: getattr(command, name) for name in _OPTIONS}
+    options |= {"metric": metric_names(command.metric), "part_size": command.in_parts.part_size}
+    if Path(command.disturbances).is_file():
+        options |= {"disturbances": absolute(command.disturbances), "wrenches": digest_of(command.disturbances)}
+    return options
+
+
+def _refuse(folder: Path, difference: str) -> None:
+    if difference:
+        raise CommandError(f"--resume {folder}: {difference}; wanted the same, or a new folder by --run")
 
 
 def rank_in_parts(command: RankOptions, folder: Path, given: GivenFiles, unit: str, clock: "Clock") -> int:
@@ -184,31 +203,21 @@ def _job(command: RankOptions, folder: Path, given: GivenFiles) -> "Job":
     """
     from jaxgrasp.ranking.streams.folder import Manifest
     from jaxgrasp.ranking.streams.run import Job
-    from jaxgrasp.ranking.streams.sources import absolute, digest_of
 
-    version = _version()
-    options: dict[str, Any] = {name: getattr(command, name) for name in _OPTIONS}
-    options |= {"metric": list(given.setting.metrics), "part_size": command.in_parts.part_size}
-    if Path(command.disturbances).is_file():
-        options |= {"disturbances": absolute(command.disturbances), "wrenches": digest_of(command.disturbances)}
     if command.in_parts.resume is None:
-        manifest = Manifest.new(version, options | {"part_bytes": allowance() // _SHARES}, given.sources)
+        manifest = Manifest.new(_version(), _options(command), allowance() // _SHARES, given.sources)
         manifest.write(folder)
         signals.note_written(folder / "manifest.json")
     else:
         manifest = Manifest.read(folder)
-        difference = manifest.difference(
-            version, options | {"part_bytes": manifest.options["part_bytes"]}, given.sources
-        )
-        if difference:
-            raise CommandError(f"--resume {folder}: {difference}; wanted the same, or a new folder by --run")
+        _refuse(folder, manifest.other_inputs(given.sources))
     return Job(
         folder=folder,
         run=manifest.run,
         sources=_named_as_begun(given.sources, manifest),
         setting=given.setting,
         part_rows=manifest.options["part_size"],
-        part_size=manifest.options["part_bytes"],
+        part_size=manifest.part_bytes,
         keep_going=given.keep_going,
     )
 

@@ -1,6 +1,7 @@
 """Contacts: where the fingers touch, with which friction and strength."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -119,6 +120,48 @@ class Contacts:
                 f"like positions {jnp.shape(positions)}"
             )
         return cls.from_frames(positions, _frames(normals), friction=friction, max_force=max_force, active=active)
+
+    @classmethod
+    def from_dlpack(
+        cls,
+        positions: Any,
+        frames: Any,
+        *,
+        friction: Any,
+        max_force: Any,
+        active: Any | None = None,
+    ) -> "Contacts":
+        """Contacts in arrays of another library (PyTorch, CuPy, NumPy), which share their memory where JAX can read it.
+
+        JAX copies arrays that do not begin at a multiple of 64 bytes, and those that are not laid out row by row. The
+        other library must not write to arrays that are shared. Results go back the same way: every array of JAX has
+        `__dlpack__`, which `torch.from_dlpack` and the like take.
+
+        Args:
+            positions: (*batch, n_c, 3), m, float32 or float64, like all that follow.
+            frames: (*batch, n_c, 3, 3), rotations with columns t1, t2, n (outward).
+            friction: (*batch, n_c), >= 0; or a number.
+            max_force: (*batch, n_c), N, finite and positive; or a number.
+            active: bool (*batch, n_c); None means that every contact is there.
+
+        Raises:
+            ValueError: shapes that do not fit.
+        """
+        leaves = {"positions": positions, "frames": frames, "friction": friction, "max_force": max_force}
+        leaves["active"] = True if active is None else active
+        found = {name: jnp.from_dlpack(x) for name, x in leaves.items() if hasattr(x, "__dlpack__")}
+        for name in ("positions", "frames"):
+            if name not in found:
+                raise ValueError(f"{name}: got {type(leaves[name]).__name__}, wanted an array with __dlpack__")
+        shape, dtype = found["positions"].shape[:-1], found["positions"].dtype
+        for name, event in _EVENTS.items():
+            kind = jnp.bool_ if name == "active" else dtype
+            if name not in found:
+                found[name] = jnp.full(shape, leaves[name], kind)
+            if found[name].shape != (*shape, *event) or found[name].dtype != kind:
+                got = f"{found[name].dtype.name} {found[name].shape}"
+                raise ValueError(f"{name}: got {got}, wanted {jnp.dtype(kind).name} {(*shape, *event)}")
+        return cls(**found)
 
     def check_precision(self) -> None:
         """Refuse what nothing here can compute with.

@@ -38,13 +38,16 @@ class Manifest:
     """The run's own name, which its parts have, too."""
     options: dict[str, Any]
     """What was asked, by the options' names; values are JSON's."""
+    part_bytes: int
+    """Bytes a part, at most, in memory."""
     inputs: list[dict[str, Any]]
     """Name, path, number of candidates, size and digest of every file."""
 
     @classmethod
-    def new(cls, version: str, options: dict[str, Any], sources: Sequence[Source]) -> "Manifest":
+    def new(cls, version: str, options: dict[str, Any], part_bytes: int, sources: Sequence[Source]) -> "Manifest":
         """The manifest of a run that begins."""
-        return cls(version=version, run=secrets.token_hex(8), options=options, inputs=_inputs(sources))
+        name = secrets.token_hex(8)
+        return cls(version=version, run=name, options=options, part_bytes=part_bytes, inputs=_inputs(sources))
 
     @classmethod
     def read(cls, folder: Path) -> "Manifest":
@@ -73,19 +76,26 @@ class Manifest:
         with atomic_write(folder / MANIFEST) as stream:
             stream.write(json.dumps({"format": _FORMAT, **asdict(self)}, indent=1).encode())
 
-    def difference(self, version: str, options: dict[str, Any], sources: Sequence[Source]) -> str:
-        """What is not as it was when the run began, in words; empty where all is.
+    def other_options(self, version: str, options: dict[str, Any]) -> str:
+        """What is asked otherwise than when the run began, in words; empty where nothing is.
 
         Args:
             version: Of the package.
             options: What is asked now.
-            sources: The files as they are now.
         """
         if version != self.version:
             return f"version: got jaxgrasp {version}; the run was begun by {self.version}"
         for name, value in self.options.items():
             if options.get(name) != value:
                 return f"--{name.replace('_', '-')}: got {options.get(name)}; the run has {value}"
+        return ""
+
+    def other_inputs(self, sources: Sequence[Source]) -> str:
+        """Which file is not as it was when the run began, in words; empty where all are.
+
+        Args:
+            sources: The files as they are now.
+        """
         now = _inputs(sources)
         for before, after in zip(self.inputs, now, strict=False):
             for key in _OF_SOURCES:

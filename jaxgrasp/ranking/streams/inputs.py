@@ -68,7 +68,7 @@ def _names_at(url: str) -> list[str]:
     path = parts.path
     if magic:
         # The folder above the first part of the path that is a pattern.
-        plain = [piece for piece in path.split("/")]
+        plain = path.split("/")
         path = "/".join(plain[: next(n for n, piece in enumerate(plain) if glob.has_magic(piece))])
     base = urlunsplit(parts._replace(path=path))
     with reading(url):
@@ -79,7 +79,8 @@ def _names_at(url: str) -> list[str]:
             return [url]
         inside = system.get_file_info(fs.FileSelector(inner, recursive=True, allow_not_found=True))
     files = sorted(info.path for info in inside if info.type == fs.FileType.File)
-    whole = lambda found: parts.netloc + "/" + found.removeprefix(parts.netloc).lstrip("/")
+    # Some file systems count the host, or the bucket, as part of the path.
+    whole = lambda found: parts.netloc + "/" + found.lstrip("/").removeprefix(f"{parts.netloc}/")
     if magic:
         wanted = parts.netloc + "/" + parts.path.lstrip("/")
         fitting = [found for found in files if fnmatch.fnmatchcase(whole(found), wanted)]

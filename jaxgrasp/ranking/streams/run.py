@@ -211,9 +211,11 @@ class _Steps:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        for pool in self._pools:
-            pool.shutdown(cancel_futures=True)
+        reading, writing = self._pools
+        reading.shutdown(cancel_futures=True)
         self._reader.close()
+        # What is solved is worth the time that writing takes, also where nothing follows.
+        writing.shutdown()
         if kind is None and self._writing is not None:
             self._writing.result()
 
