@@ -311,7 +311,8 @@ class _Bounded:
     def read(self, size: int = -1) -> bytes:
         if size > _DIRECTORY:
             raise zipfile.BadZipFile(f"a directory of {in_bytes(size)}")
-        return self._stream.read(size)
+        # To the end, of which Arrow's streams know no number.
+        return self._stream.read() if size < 0 else self._stream.read(size)
 
 
 def _refuse_kind(path: Path | str, magic: bytes, wanted: str) -> NoReturn:

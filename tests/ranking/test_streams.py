@@ -151,10 +151,40 @@ def test_urls(here, capsys):
     assert ran("memory://grasps", "--run", "found", "--top", 4) == 0
     assert rows_of("found").num_rows == 80
     assert set(rows_of("found")["source"].to_pylist()) == {"memory://grasps/a.npz", "memory://grasps/b.parquet"}
-    assert ran(f"file://{here}/a.np?", "--run", "other", "--top", 4) == 0
+    assert ran(f"file://{here}/a.n*", "--run", "other", "--top", 4) == 0
     assert rows_of("other").num_rows == 40
     assert ran("memory://nowhere", "--run", "none") == 2
     assert "memory://nowhere: got" in capsys.readouterr().err
+
+
+def test_a_server_of_objects(here, monkeypatch):
+    moto, boto3 = pytest.importorskip("moto.server"), pytest.importorskip("boto3")
+    server = moto.ThreadedMotoServer(port=0, verbose=False)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        for name, value in {
+            "AWS_ACCESS_KEY_ID": "testing",
+            "AWS_SECRET_ACCESS_KEY": "testing",
+            "AWS_DEFAULT_REGION": "us-east-1",
+            "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        }.items():
+            monkeypatch.setenv(name, value)
+        client = boto3.client("s3")
+        client.create_bucket(Bucket="grasps")
+        for name in ("a.npz", "b.parquet", "c.feather"):
+            client.upload_file(str(write(here / name, seed=ord(name[0]))), "grasps", f"in/{name}")
+        assert ran("s3://grasps/in", "--run", "found", "--top", TOP, "--part-size", 50) == 0
+        assert ran("a.npz", "b.parquet", "c.feather", "--run", "local", "--top", TOP, "--part-size", 50) == 0
+        assert ran("s3://grasps/in/*.parquet", "--top", TOP, "--figure", "None") == 0
+    finally:
+        server.stop()
+    names = ["index", "margin", "upper_bound", "status", "name"]
+    assert rows_of("found").select(names).equals(rows_of("local").select(names))
+    assert set(rows_of("found")["source"].to_pylist()) == {
+        f"s3://grasps/in/{name}" for name in ("a.npz", "b.parquet", "c.feather")
+    }
+    assert pyarrow.parquet.read_table("ranking.parquet").num_rows == 40
 
 
 def test_a_bad_file_among_others(here, capsys):
