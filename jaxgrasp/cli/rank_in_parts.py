@@ -181,7 +181,9 @@ def rank_in_parts(command: RankOptions, folder: Path, given: GivenFiles, unit: s
 
     try:
         with made_folder(folder):
-            if command.in_parts.resume is None and any(folder.iterdir()):
+            # A process that was killed at once leaves no more than hidden files.
+            there = [path for path in folder.iterdir() if not path.name.startswith(".")]
+            if command.in_parts.resume is None and there:
                 got = "the folder of a run" if (folder / "manifest.json").exists() else "a folder with files in it"
                 raise CommandError(f"{folder}: got {got}; wanted a new one, or --resume {folder}")
             with held(folder):

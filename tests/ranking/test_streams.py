@@ -3,11 +3,6 @@
 import json
 import os
 import pickle
-import random
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +13,7 @@ import pyarrow.parquet
 import pytest
 
 import jaxgrasp as jg
+from benchmarks.assaults import resumed
 from jaxgrasp.candidates import Candidates, concatenate, read_candidates, sample_grasps
 from jaxgrasp.candidates.arrow import candidates_of_table, table_of_candidates
 from jaxgrasp.cli import main
@@ -370,39 +366,10 @@ def test_two_at_once_are_refused(begun, capsys):
     assert "found: cannot be used (another process is at work on it)" in capsys.readouterr().err
 
 
-def killed_and_resumed(home: Path, kills: int, seed: int, files: int = 4, rows: int = 1_000) -> None:
-    """kill -9 at random moments of one run; what comes out in the end is that of a run that nobody disturbed."""
-    for number in range(files):
-        write(home / f"{number}.npz", count=rows, seed=number)
-    command = [sys.executable, "-m", "jaxgrasp.cli", "rank", "--figure", "None"]
-    options = [f"{number}.npz" for number in range(files)] + ["--part-size", str(files * rows // 40), "--run"]
-    run = lambda *rest: subprocess.run([*command, *rest], cwd=home, check=True, capture_output=True)
-    begin = time.monotonic()
-    run(*options, "whole")
-    took = time.monotonic() - begin
-    draw = random.Random(seed)
-    arguments, done = [*options, "found"], 0
-    for _ in range(kills):
-        process = subprocess.Popen(
-            [*command, *arguments], cwd=home, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        time.sleep(draw.uniform(0.0, took))
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        if (home / "found" / "manifest.json").exists():
-            arguments = ["--resume", "found"]
-        done += process.returncode == -signal.SIGKILL
-    run(*arguments)
-    assert done > 0
-    assert rows_of(home / "found").equals(rows_of(home / "whole"))
-    tables = [pyarrow.parquet.read_table(home / name / "top.parquet") for name in ("found", "whole")]
-    assert tables[0].equals(tables[1])
-    assert len(list((home / "found" / "parts").iterdir())) == 40
-
-
 @pytest.mark.thorough
 def test_killed_it_goes_on(tmp_path):
-    killed_and_resumed(tmp_path, kills=5, seed=0)
+    found = resumed.killed(tmp_path, kills=5, rows=4_000, seed=0)
+    assert found["kills"] == 5 and found["runs that were ended by --resume"] >= 1
 
 
 def test_the_best_without_sorting_the_others():
