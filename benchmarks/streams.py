@@ -109,9 +109,10 @@ def _report(found: dict[str, list[dict[str, float]]], candidates: int, memory: i
     lines = [
         "# Ranking in parts",
         "",
-        f"`python -m benchmarks.streams`: {candidates:,} candidates of {CONTACTS} contacts with --run, and {memory:,} in "
-        f"memory, float64, table, figure and the forces of {TOP}; {os.cpu_count()} cores, load average at the start {load:.1f}. "
-        f"Medians of {len(found['in parts'])} rounds by turns; whole commands once everything is compiled.",
+        f"`python -m benchmarks.streams`: {candidates:,} candidates of {CONTACTS} contacts with --run, and "
+        f"{memory:,} in memory, float64, table, figure and the forces of {TOP}; {os.cpu_count()} cores, load average "
+        f"at the start {load:.1f}. Medians of {len(found['in parts'])} rounds by turns; whole commands once everything "
+        "is compiled.",
         "",
         "| | s | processor s | candidates a second | a processor second | peak memory, GiB |",
         "| --- | --- | --- | --- | --- | --- |",
@@ -145,8 +146,8 @@ def _reference(home: Path, files: list[Path], run: Path) -> str:
     rows = pyarrow.parquet.read_table(run / "parts", columns=["margin"])["margin"].to_numpy()
     whole = float(np.nanmax(np.abs(rows - ranking.margin)))
     return (
-        f"\nThe best {TOP} of {len(candidates):,} are {'the same' if same else 'OTHERS'} as in memory, in the same order, "
-        f"with margins at most {apart:.1e} apart; all margins are at most {whole:.1e} apart.\n"
+        f"\nThe best {TOP} of {len(candidates):,} are {'the same' if same else 'OTHERS'} as in memory, in "
+        f"the same order, with margins at most {apart:.1e} apart; all margins are at most {whole:.1e} apart.\n"
     )
 
 

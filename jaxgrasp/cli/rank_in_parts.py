@@ -1,7 +1,7 @@
 """`jaxgrasp rank` of more candidates than one table is for: part by part into a folder, and on from there."""
 
 import importlib.metadata
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jaxgrasp.disturbance import DisturbanceSet
     from jaxgrasp.ranking.streams.folder import Manifest
     from jaxgrasp.ranking.streams.run import Job
-    from jaxgrasp.ranking.streams.scored import Setting
+    from jaxgrasp.ranking.streams.scored import Setting, Summary
     from jaxgrasp.ranking.streams.sources import Source
 
 R = TypeVar("R", bound=RankOptions)
@@ -234,7 +234,10 @@ def _rank(command: RankOptions, job: "Job", given: GivenFiles, unit: str, clock:
     clock.lap()
     try:
         with progress_bar(job.rows, clock) as progress:
-            summary = run_job(job, skipped=given.skipped, progress=progress, look=look)
+            if command.in_parts.ray is None:
+                summary = run_job(job, skipped=given.skipped, progress=progress, look=look)
+            else:
+                summary = _on_ray(command, job, given, progress)
     except KeyboardInterrupt as reason:
         done = clock.ticks[-1][1] if clock.ticks else 0
         line = f"{signals.word()}: ranked {done:,} of {job.rows:,}; jaxgrasp rank --resume {_shown(command)} goes on"
@@ -265,6 +268,23 @@ def _rank(command: RankOptions, job: "Job", given: GivenFiles, unit: str, clock:
     with printing():
         print_ranking(ranking, summary.sketch, unit, clock, (), [folder / "parts", *written, *drawn])
     conclude("", unwritten)
+
+
+def _on_ray(command: RankOptions, job: "Job", given: GivenFiles, progress: Callable[[int], None]) -> "Summary":
+    """Ranks on a cluster.
+
+    Raises:
+        CommandError: There is no such cluster.
+    """
+    from jaxgrasp.ranking.streams.on_ray import cluster, on_all_nodes, run_on_ray
+
+    address = command.in_parts.ray
+    assert address is not None
+    try:
+        with cluster(address, command.in_parts.ray_workers) as workers:
+            return run_on_ray(on_all_nodes(job), workers, budget=allowance(), skipped=given.skipped, progress=progress)
+    except (ConnectionError, ImportError) as error:
+        raise CommandError(f"--ray {address}: got no cluster ({' '.join(str(error).split())})") from error
 
 
 class _Conventions:

@@ -1,5 +1,6 @@
 """The options of `jaxgrasp rank`."""
 
+import importlib.util
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +30,13 @@ class InParts:
     sorted: bool = False
     """With a folder: write all candidates once more, the best first."""
 
+    ray: str | None = None
+    """With a folder that all nodes see: rank on a cluster of Ray, by its ADDRESS, or "local" for one of this machine's
+    own. Needs the extra ray."""
+
+    ray_workers: int | None = None
+    """With --ray: processes at work; None is one a GPU, and without GPUs one a processor."""
+
     part_size: int = 131_072
     """With a folder: candidates a part, at most."""
 
@@ -44,7 +52,14 @@ class InParts:
             CommandError: An option cannot be used.
         """
         check_options(("--part-size", self.part_size, self.part_size >= 1, "at least 1"))
+        if self.ray_workers is not None:
+            check_options(("--ray-workers", self.ray_workers, self.ray_workers >= 1, "at least 1"))
+        if self.ray is not None and importlib.util.find_spec("ray") is None:
+            raise CommandError("--ray: Ray is not installed; wanted pip install 'jaxgrasp[ray]'")
         if self.folder is None:
+            if self.ray is not None or self.sorted:
+                option = "--ray" if self.ray is not None else "--sorted"
+                raise CommandError(f"{option}: got neither --run nor --resume; wanted a folder")
             return
         option = "--run" if self.run else "--resume"
         if self.run and self.resume:

@@ -1,0 +1,239 @@
+"""The same parts on a cluster: Ray gives them to workers, and does again what a lost one had.
+
+Every node must see the inputs and the run's folder by the same paths. Workers write their parts themselves, under names
+of their own, so that a part that is done twice is there once; what goes over the network is a summary a part.
+"""
+
+import contextlib
+import json
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from jax.typing import ArrayLike
+from pyarrow import ipc
+
+from jaxgrasp.ranking.streams.run import Job, Read, Skipped
+from jaxgrasp.ranking.streams.scored import Summary
+from jaxgrasp.ranking.streams.tables import TableRanker
+from jaxgrasp.storage import limited_to
+
+if TYPE_CHECKING:
+    from ray.data import Dataset
+
+# So many summaries make one, in tasks, as long as there are more than the driver should merge itself.
+_MERGED, _LEFT = 32, 256
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Jax:
+    """How JAX is set in the driver, and shall be in workers."""
+
+    x64: bool
+    cache: str | None
+
+    @classmethod
+    def own(cls) -> "_Jax":
+        import jax
+
+        # JAX gives its configuration the options while it is imported: no stub has them.
+        cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+        return cls(x64=jax.config.jax_enable_x64, cache=cache)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def set(self) -> None:
+        import jax
+
+        jax.config.update("jax_enable_x64", self.x64)
+        if self.cache is not None:
+            jax.config.update("jax_compilation_cache_dir", self.cache)
+
+
+@contextlib.contextmanager
+def cluster(address: str, workers: int | None = None) -> Iterator[dict[str, Any]]:
+    """Joins a cluster, or starts one on this machine, and leaves it again; one that was joined before stays.
+
+    Args:
+        address: That of a cluster, or "local" for one of this machine's own.
+        workers: How many processes; None is one a GPU, and without GPUs one a processor.
+
+    Yields:
+        What `map_batches` is to be told of workers.
+
+    Raises:
+        ImportError: Ray is not installed.
+        ConnectionError: There is no such cluster.
+    """
+    import ray
+    import ray.data
+
+    mine = not ray.is_initialized()
+    if mine:
+        own = {"num_cpus": workers} if address == "local" else {"address": address}
+        ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR", **own)
+    try:
+        logging.getLogger("ray.data").setLevel(logging.ERROR)
+        there = ray.cluster_resources()
+        gpus = int(there.get("GPU", 0))
+        count = workers or gpus or int(there.get("CPU", 1))
+        pool = ray.data.ActorPoolStrategy(size=count)
+        yield {"compute": pool, **({"num_gpus": 1} if gpus else {"num_cpus": 1})}
+    finally:
+        if mine:
+            ray.shutdown()
+
+
+def run_on_ray(
+    job: Job,
+    workers: dict[str, Any],
+    *,
+    budget: int,
+    skipped: Skipped | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Summary:
+    """Does all parts of a run that are not there yet on a cluster, see `run_job`.
+
+    With `prune`, candidates are given up for what is best in their own part, whatever order parts are done in.
+
+    Args:
+        job: The run; its folder is an absolute path that all nodes see.
+        workers: Of `cluster`.
+        budget: Bytes of memory that one file may ask for.
+        skipped: Told of what could not be read.
+        progress: Called with the number of candidates done.
+
+    Returns:
+        The summary of all parts.
+
+    Raises:
+        RuntimeError: A part failed in the same way several times.
+    """
+    import ray
+
+    report, tell = progress or (lambda _: None), skipped or (lambda _: None)
+    context = ray.data.DataContext.get_current()
+    # Of equals the first one is to rank first: summaries are merged in the order of their parts.
+    context.execution_options.preserve_order = True
+    parts = len(job.plan)
+    rows = ray.data.from_items([{"part": number} for number in range(parts)], override_num_blocks=parts)
+    rows = rows.map_batches(
+        _Worker,
+        fn_constructor_args=(job, _Jax.own(), budget),
+        batch_size=1,
+        batch_format="pyarrow",
+        **workers,
+    )
+    while parts > _LEFT:
+        rows = rows.map_batches(_merge, fn_args=(job.setting.top,), batch_size=_MERGED, batch_format="pyarrow")
+        parts = -(-parts // _MERGED)
+    found, done = [], 0
+    for row in rows.iter_rows():
+        found.append(_opened(row["summary"]))
+        for error in json.loads(row["skipped"]):
+            tell(ValueError(error))
+        done += row["rows"]
+        report(done)
+    return Summary.merged(found, job.setting.top)
+
+
+class _Worker:
+    """Does parts in a process that keeps what it has compiled."""
+
+    def __init__(self, job: Job, jax: _Jax, budget: int):
+        jax.set()
+        self._job, self._reader, self._budget = job, job.reader(), budget
+
+    def __call__(self, batch: pa.Table) -> pa.Table:
+        with limited_to(self._budget):
+            return pa.Table.from_pylist([self._one(number) for number in batch["part"].to_pylist()])
+
+    def _one(self, number: int) -> dict[str, Any]:
+        rows = sum(segment.stop - segment.start for segment in self._job.plan[number])
+        found = self._job.parts.finished(number)
+        if found is None:
+            read: Read = self._job.read(self._reader, number)
+            table, summary = self._job.score(read)
+            self._job.write(read, table, summary)
+            found = summary, [str(error) for error in read.errors]
+        return {"summary": _closed(found[0]), "skipped": json.dumps(found[1]), "rows": rows}
+
+
+def _merge(batch: pa.Table, top: int) -> pa.Table:
+    summary = Summary.merged([_opened(each) for each in batch["summary"].to_pylist()], top)
+    skipped = [error for each in batch["skipped"].to_pylist() for error in json.loads(each)]
+    rows = sum(batch["rows"].to_pylist())
+    return pa.Table.from_pylist([{"summary": _closed(summary), "skipped": json.dumps(skipped), "rows": rows}])
+
+
+def _closed(summary: Summary) -> bytes:
+    table, sink = summary.to_table(), pa.BufferOutputStream()
+    with ipc.new_stream(sink, table.schema) as writer:
+        writer.write_table(table)
+    return sink.getvalue().to_pybytes()
+
+
+def _opened(content: bytes) -> Summary:
+    return Summary.from_table(ipc.open_stream(content).read_all())
+
+
+def rank_dataset(
+    dataset: "Dataset",
+    disturbances: ArrayLike | None = None,
+    *,
+    gravity: float = 0.0,
+    cone_edges: int = 8,
+    friction: float | None = None,
+    max_force: float | None = None,
+    metrics: Sequence[str] = (),
+    workers: int | None = None,
+    batch: int = 8192,
+) -> "Dataset":
+    """Finds the margins (21) of the candidates in a Ray dataset, on all nodes of the cluster that is joined.
+
+    Args:
+        dataset: A row a candidate, see `jaxgrasp.candidates.arrow`.
+        disturbances: As for `TableRanker`, like all that follow.
+        gravity: m/s^2 along the object's -z.
+        cone_edges: Edges of the friction pyramid.
+        friction: Coulomb's coefficient where the rows have none.
+        max_force: Largest normal force where the rows have none, N.
+        metrics: Names of other metrics.
+        workers: How many processes; None is one a GPU, and without GPUs one a processor.
+        batch: Candidates at a time.
+
+    Returns:
+        The dataset with the columns margin, upper_bound, status and those of metrics, which is computed when it is
+        read; a lost worker's batch is done again.
+
+    Raises:
+        ImportError: Ray is not installed.
+        ValueError: A metric is unknown.
+    """
+    options = {"gravity": gravity, "cone_edges": cone_edges, "friction": friction, "max_force": max_force}
+    ranker = TableRanker(None if disturbances is None else np.asarray(disturbances), metrics=metrics, **options)
+    with cluster("auto", workers) as resources:
+        return dataset.map_batches(
+            _Ranker,
+            fn_constructor_args=(ranker, _Jax.own()),
+            batch_size=batch,
+            batch_format="pyarrow",
+            **resources,
+        )
+
+
+class _Ranker:
+    """A ranker in a process that is set like the driver."""
+
+    def __init__(self, ranker: TableRanker, jax: _Jax):
+        jax.set()
+        self._ranker = ranker
+
+    def __call__(self, batch: pa.Table) -> pa.Table:
+        return self._ranker(batch)
+
+
+def on_all_nodes(job: Job) -> Job:
+    """The run with a folder that means the same to every process."""
+    return replace(job, folder=job.folder.absolute())
