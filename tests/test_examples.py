@@ -13,7 +13,9 @@ def test_they_are_numbered():
     assert len(EXAMPLES) >= 2
 
 
-SLOW = ("02_tightening_and_blocking_forces", "03_mesh_to_grasp", "04_push_at_rest", "05_push_in_motion")
+# What examples need beside the package.
+NEEDED = {"08_tables_in_dask": "dask", "09_tables_in_spark": "pyspark", "10_tables_in_ray": "ray"}
+SLOW = (*NEEDED, "02_tightening_and_blocking_forces", "03_mesh_to_grasp", "04_push_at_rest", "05_push_in_motion")
 
 
 @pytest.mark.parametrize(
@@ -22,6 +24,7 @@ SLOW = ("02_tightening_and_blocking_forces", "03_mesh_to_grasp", "04_push_at_res
     ids=lambda path: path.stem,
 )
 def test_example(path, tmp_path, monkeypatch, capsys):
+    pytest.importorskip(NEEDED.get(path.stem, "jaxgrasp"))
     assert len(path.read_text().splitlines()) < 80
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(path), run_name="__main__")

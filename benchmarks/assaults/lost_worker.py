@@ -54,9 +54,8 @@ def _workers(parent: int) -> list[int]:
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             above[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            if (folder / "cmdline").read_bytes().startswith(b"ray::") and b"_Worker" in (
-                folder / "cmdline"
-            ).read_bytes():
+            title = (folder / "cmdline").read_bytes()
+            if title.startswith(b"ray::") and b"MapWorker" in title:
                 found.append(int(folder.name))
         except OSError:
             continue

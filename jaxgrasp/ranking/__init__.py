@@ -3,7 +3,7 @@
 from jaxgrasp.ranking.comparison import MetricComparison, Prediction, compare_metrics
 from jaxgrasp.ranking.rank import Ranking, RankingInterrupted, rank
 from jaxgrasp.ranking.scores import check_metrics, score
-from jaxgrasp.ranking.streams import TableRanker, rank_batches
+from jaxgrasp.ranking.streams import TableRanker, rank_batches, rank_dataset
 from jaxgrasp.ranking.table import TABLE_ENDINGS, ranking_table, write_table
 from jaxgrasp.ranking.zero_margins import is_zero, why_zero
 
@@ -19,6 +19,7 @@ __all__ = [
     "is_zero",
     "rank",
     "rank_batches",
+    "rank_dataset",
     "ranking_table",
     "score",
     "why_zero",

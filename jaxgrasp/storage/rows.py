@@ -1,6 +1,5 @@
 """Arrays of an archive read some rows at a time: the file may be larger than memory."""
 
-import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +8,8 @@ import numpy as np
 
 from jaxgrasp.storage.arrays import BROKEN, Archive, array_of_bytes, damaged
 from jaxgrasp.storage.reading import FileError, allowance, in_bytes
+
+_PIECE = 1 << 20
 
 
 class ArchiveRows:
@@ -41,8 +42,14 @@ class ArchiveRows:
             FileError: The file is damaged.
         """
         for name, stream in self._streams.items():
+            left = rows * self._row(name)
             try:
-                stream.seek(rows * self._row(name), os.SEEK_CUR)
+                # zipfile's own `seek` reads all of it, too, in larger pieces.
+                while left > 0:
+                    part = len(stream.read(min(left, _PIECE)))
+                    if not part:
+                        raise EOFError("it ends early")
+                    left -= part
             except BROKEN as error:
                 damaged(self._path, name, error)
         self._at += rows
@@ -73,7 +80,7 @@ class ArchiveRows:
         try:
             # `readinto` of zip files copies what `read` gives.
             while done < len(data):
-                part = stream.read(min(len(data) - done, 1 << 20))
+                part = stream.read(min(len(data) - done, _PIECE))
                 if not part:
                     raise EOFError("it ends early")
                 view[done : done + len(part)] = part

@@ -108,9 +108,10 @@ def run_on_ray(
         The summary of all parts.
 
     Raises:
-        RuntimeError: A part failed in the same way several times.
+        RuntimeError: A part failed for another reason than that its worker was lost.
     """
     import ray
+    import ray.exceptions
 
     report, tell = progress or (lambda _: None), skipped or (lambda _: None)
     context = ray.data.DataContext.get_current()
@@ -129,13 +130,22 @@ def run_on_ray(
         rows = rows.map_batches(_merge, fn_args=(job.setting.top,), batch_size=_MERGED, batch_format="pyarrow")
         parts = -(-parts // _MERGED)
     found, done = [], 0
-    for row in rows.iter_rows():
-        found.append(_opened(row["summary"]))
-        for error in json.loads(row["skipped"]):
-            tell(ValueError(error))
-        done += row["rows"]
-        report(done)
+    try:
+        for row in rows.iter_rows():
+            found.append(_opened(row["summary"]))
+            for error in json.loads(row["skipped"]):
+                tell(ValueError(error))
+            done += row["rows"]
+            report(done)
+    except ray.exceptions.RayError as error:
+        raise RuntimeError(_first_cause(error)) from error
     return Summary.merged(found, job.setting.top)
+
+
+def _first_cause(error: BaseException) -> str:
+    """What went wrong in a worker, without the places in its program."""
+    below = getattr(error, "cause", None) or error.__cause__
+    return _first_cause(below) if isinstance(below, BaseException) else str(error).strip().splitlines()[-1]
 
 
 class _Worker:
