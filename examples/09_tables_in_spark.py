@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pyarrow as pa
 import pyarrow.parquet
 from pyspark.sql import SparkSession
-from pyspark.sql.types import DoubleType, StringType
+from pyspark.sql.types import DoubleType, StringType, StructField, StructType
 
 from jaxgrasp.candidates import sample_grasps
 from jaxgrasp.candidates.arrow import table_of_candidates
@@ -29,7 +29,8 @@ def main() -> None:
     os.environ["PYSPARK_PYTHON"] = sys.executable
     spark = SparkSession.builder.master("local[2]").config("spark.ui.enabled", "false").getOrCreate()
     grasps = spark.read.parquet("grasps.parquet")
-    schema = grasps.schema.add("margin", DoubleType()).add("upper_bound", DoubleType()).add("status", StringType())
+    own = [("margin", DoubleType()), ("upper_bound", DoubleType()), ("status", StringType())]
+    schema = StructType([*grasps.schema, *(StructField(name, kind) for name, kind in own)])
     best = grasps.mapInArrow(ranked, schema).orderBy("margin", ascending=False).limit(10)
     pyarrow.parquet.write_table(best.toArrow(), "best.parquet")
     spark.stop()

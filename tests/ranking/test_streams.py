@@ -22,7 +22,7 @@ from jaxgrasp.ranking.order import best_of, order_of
 from jaxgrasp.ranking.sketch import Sketch
 from jaxgrasp.ranking.streams import plan
 from jaxgrasp.ranking.streams.inputs import names_of, sources_of
-from jaxgrasp.ranking.streams.sources import Given
+from jaxgrasp.ranking.streams.sources import Given, rows_from
 from jaxgrasp.storage import FileError, limited_to
 
 TOP = 8
@@ -410,6 +410,15 @@ def test_parts_divide_files(here):
     small = plan.parts_of(sources, 1_000, 4 * sources[0].row_size)
     assert max(sum(s.stop - s.start for s in part) for part in small) == 4
     assert sum(s.stop - s.start for part in small for s in part) == 50
+
+
+def test_rows_from_the_middle_of_a_large_file(here):
+    # More bytes lie before them than are read at once.
+    positions = np.random.default_rng(0).normal(size=(60_000, 4, 3))
+    np.savez(here / "a.npz", positions=positions, outward_normals=np.ones_like(positions))
+    (source,) = sources_of(["a.npz"], Given(friction=1.0, max_force=1.0))
+    with rows_from(source, 50_000, Given(friction=1.0, max_force=1.0)) as rows:
+        np.testing.assert_array_equal(rows.read(5)[0].positions, positions[50_000:50_005])
 
 
 def test_a_file_above_the_budget_is_read_in_parts(here, capsys):

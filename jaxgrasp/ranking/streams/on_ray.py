@@ -5,11 +5,12 @@ of their own, so that a part that is done twice is there once; what goes over th
 """
 
 import contextlib
+import importlib
 import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,10 +20,10 @@ from pyarrow import ipc
 from jaxgrasp.ranking.streams.run import Job, Read, Skipped
 from jaxgrasp.ranking.streams.scored import Summary
 from jaxgrasp.ranking.streams.tables import TableRanker
-from jaxgrasp.storage import limited_to
+from jaxgrasp.storage import FileError, limited_to
 
-if TYPE_CHECKING:
-    from ray.data import Dataset
+# Ray is optional, and what is not installed has no types.
+Dataset = Any
 
 # So many summaries make one, in tasks, as long as there are more than the driver should merge itself.
 _MERGED, _LEFT = 32, 256
@@ -66,9 +67,7 @@ def cluster(address: str, workers: int | None = None) -> Iterator[dict[str, Any]
         ImportError: Ray is not installed.
         ConnectionError: There is no such cluster.
     """
-    import ray
-    import ray.data
-
+    ray = _ray()
     mine = not ray.is_initialized()
     if mine:
         own = {"num_cpus": workers} if address == "local" else {"address": address}
@@ -108,11 +107,10 @@ def run_on_ray(
         The summary of all parts.
 
     Raises:
+        ValueError: A file cannot be read, or a part cannot be written.
         RuntimeError: A part failed for another reason than that its worker was lost.
     """
-    import ray
-    import ray.exceptions
-
+    ray = _ray()
     report, tell = progress or (lambda _: None), skipped or (lambda _: None)
     context = ray.data.DataContext.get_current()
     # Of equals the first one is to rank first: summaries are merged in the order of their parts.
@@ -132,20 +130,16 @@ def run_on_ray(
     found, done = [], 0
     try:
         for row in rows.iter_rows():
+            if row["failed"]:
+                raise ValueError(row["failed"])
             found.append(_opened(row["summary"]))
             for error in json.loads(row["skipped"]):
                 tell(ValueError(error))
             done += row["rows"]
             report(done)
     except ray.exceptions.RayError as error:
-        raise RuntimeError(_first_cause(error)) from error
+        raise RuntimeError(str(error).strip().splitlines()[0]) from error
     return Summary.merged(found, job.setting.top)
-
-
-def _first_cause(error: BaseException) -> str:
-    """What went wrong in a worker, without the places in its program."""
-    below = getattr(error, "cause", None) or error.__cause__
-    return _first_cause(below) if isinstance(below, BaseException) else str(error).strip().splitlines()[-1]
 
 
 class _Worker:
@@ -156,8 +150,14 @@ class _Worker:
         self._job, self._reader, self._budget = job, job.reader(), budget
 
     def __call__(self, batch: pa.Table) -> pa.Table:
-        with limited_to(self._budget):
-            return pa.Table.from_pylist([self._one(number) for number in batch["part"].to_pylist()])
+        (number,) = batch["part"].to_pylist()
+        try:
+            with limited_to(self._budget):
+                found = self._one(number)
+        except (FileError, OSError) as error:
+            # Ray would do the part again, which mends neither files nor disks, and wrap the error.
+            found = {"summary": b"", "skipped": "[]", "rows": 0, "failed": str(error)}
+        return pa.Table.from_pylist([found])
 
     def _one(self, number: int) -> dict[str, Any]:
         rows = sum(segment.stop - segment.start for segment in self._job.plan[number])
@@ -167,14 +167,21 @@ class _Worker:
             table, summary = self._job.score(read)
             self._job.write(read, table, summary)
             found = summary, [str(error) for error in read.errors]
-        return {"summary": _closed(found[0]), "skipped": json.dumps(found[1]), "rows": rows}
+        return {"summary": _closed(found[0]), "skipped": json.dumps(found[1]), "rows": rows, "failed": ""}
 
 
 def _merge(batch: pa.Table, top: int) -> pa.Table:
-    summary = Summary.merged([_opened(each) for each in batch["summary"].to_pylist()], top)
-    skipped = [error for each in batch["skipped"].to_pylist() for error in json.loads(each)]
-    rows = sum(batch["rows"].to_pylist())
-    return pa.Table.from_pylist([{"summary": _closed(summary), "skipped": json.dumps(skipped), "rows": rows}])
+    parts = batch.to_pylist()
+    failed = next((part for part in parts if part["failed"]), None)
+    if failed is not None:
+        return pa.Table.from_pylist([failed])
+    merged = {
+        "summary": _closed(Summary.merged([_opened(part["summary"]) for part in parts], top)),
+        "skipped": json.dumps([error for part in parts for error in json.loads(part["skipped"])]),
+        "rows": sum(part["rows"] for part in parts),
+        "failed": "",
+    }
+    return pa.Table.from_pylist([merged])
 
 
 def _closed(summary: Summary) -> bytes:
@@ -189,7 +196,7 @@ def _opened(content: bytes) -> Summary:
 
 
 def rank_dataset(
-    dataset: "Dataset",
+    dataset: Dataset,
     disturbances: ArrayLike | None = None,
     *,
     gravity: float = 0.0,
@@ -199,7 +206,7 @@ def rank_dataset(
     metrics: Sequence[str] = (),
     workers: int | None = None,
     batch: int = 8192,
-) -> "Dataset":
+) -> Dataset:
     """Finds the margins (21) of the candidates in a Ray dataset, on all nodes of the cluster that is joined.
 
     Args:
@@ -242,6 +249,16 @@ class _Ranker:
 
     def __call__(self, batch: pa.Table) -> pa.Table:
         return self._ranker(batch)
+
+
+def _ray() -> Any:
+    """Ray.
+
+    Raises:
+        ImportError: It is not installed.
+    """
+    importlib.import_module("ray.data")
+    return importlib.import_module("ray")
 
 
 def on_all_nodes(job: Job) -> Job:

@@ -1,6 +1,7 @@
 """Arrow tables in, Arrow tables out: the ranking as a callable that other people's pipelines run where they like."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -90,7 +91,7 @@ class TableRanker:
             table = table.append_column(name, column)
         return table
 
-    def __getstate__(self) -> dict[str, object]:
+    def __getstate__(self) -> dict[str, Any]:
         """Leaves out what JAX has: other processes have devices of their own."""
         return vars(self) | {"_setting": None}
 
