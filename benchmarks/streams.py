@@ -52,7 +52,9 @@ def main() -> None:
             warm = [str(home / "warm"), "--run", str(home / f"warm-{number}")]
             found["in memory"].append(_run(home, memory, memory, given.memory))
             found["in parts"].append(_run(home, warm, parts, given.candidates))
-        text = _report(found, given.candidates, given.memory, load)
+        text = _report(found, given.candidates, given.memory, load) + _costs(
+            home / "run-0", home / "in", given.candidates
+        )
         if given.reference:
             text += _reference(home, sorted((home / "in").iterdir()), home / "run-0")
     say(text)
@@ -128,6 +130,28 @@ def _report(found: dict[str, list[dict[str, float]]], candidates: int, memory: i
         f"the largest peak is {peak:.2f} GiB.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _costs(run: Path, inputs: Path, candidates: int) -> str:
+    """What a plan for more of them needs: bytes on disks and in networks, and how long it takes to merge summaries."""
+    from pyarrow import ipc
+
+    from jaxgrasp.ranking.streams.scored import Summary
+
+    size = lambda folder: sum(path.stat().st_size for path in folder.iterdir())
+    paths = sorted((run / "summaries").iterdir())
+    begin = time.perf_counter()
+    read = [Summary.from_table(ipc.open_file(path).read_all()) for path in paths]
+    opened = time.perf_counter()
+    Summary.merged(read, TOP)
+    merged = time.perf_counter()
+    each, rows = len(paths), candidates / len(paths)
+    return (
+        f"\nA candidate takes {size(inputs) / candidates:.0f} bytes of input and "
+        f"{size(run / 'parts') / candidates:.1f} of parts; a summary {size(run / 'summaries') / each / 1024:.0f} KiB "
+        f"for {rows:,.0f} candidates, {1e3 * (opened - begin) / each:.1f} ms to read and "
+        f"{1e3 * (merged - opened) / each:.1f} ms to merge.\n"
+    )
 
 
 def _reference(home: Path, files: list[Path], run: Path) -> str:
