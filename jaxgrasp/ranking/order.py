@@ -12,9 +12,7 @@ _ANSWERED = (Status.SOLVED, Status.UNBOUNDED)
 _LAST = {Status.INFEASIBLE: 2, Status.INVALID_INPUT: 3, Status.NOT_VERIFIED: 4}
 
 
-def certain(
-    margin: Float[np.ndarray, " batch"], status: Int[np.ndarray, " batch"]
-) -> Bool[np.ndarray, " batch"]:
+def certain(margin: Float[np.ndarray, " batch"], status: Int[np.ndarray, " batch"]) -> Bool[np.ndarray, " batch"]:
     """Which candidates have a margin that is certain; of those that are undecided it is a lower bound.
 
     Args:

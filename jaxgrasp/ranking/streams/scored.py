@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from jaxgrasp.candidates import Candidates, concatenate
 from jaxgrasp.candidates.arrow import candidates_of_table, columns_of_table, table_of_candidates
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.ranking.order import ANSWERED, best_of, least_of_best
+from jaxgrasp.ranking.order import best_of, certain, least_of_best
 from jaxgrasp.ranking.rank import Ranking, tighten
 from jaxgrasp.ranking.scores import score
 from jaxgrasp.ranking.sketch import Sketch
@@ -208,7 +208,7 @@ class Summary:
 
     def known_best(self) -> Float[np.ndarray, " best"]:
         """The margins of the best that have one."""
-        return self.best.margin[np.isin(self.best.status, ANSWERED)]
+        return self.best.margin[certain(self.best.margin, self.best.status)]
 
     def ranking(self, setting: Setting) -> Ranking:
         """The best ranked, with tightening forces, and with those other columns that NumPy knows."""
