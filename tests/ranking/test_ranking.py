@@ -14,6 +14,7 @@ from jaxgrasp.candidates import Candidates, concatenate, sample_grasps
 from jaxgrasp.cli.report import _counts
 from jaxgrasp.ranking import RankingInterrupted, rank, ranking_table, write_table
 from jaxgrasp.ranking.rank import _Scores
+from jaxgrasp.ranking.sketch import Sketch
 
 GRAVITY = 9.81
 # Every shape costs a compilation: tiles and tops of eight are shared by nearly all tests.
@@ -255,5 +256,5 @@ def test_what_is_undecided_ranks_by_its_lower_bound():
 
 def test_the_summary_says_how_many_are_undecided(grasps, ranking):
     status = np.where(np.arange(COUNT) < 2, jg.Status.MAX_ITERATIONS, ranking.status)
-    told = _counts(replace(ranking, status=status))
+    told = _counts(Sketch.of(ranking.margin, status))
     assert "2 MAX_ITERATIONS (undecided, their margins are lower bounds)" in told

@@ -124,9 +124,8 @@ def scored(
         margin[rows], upper_bound[rows], status[rows] = answer[0] + 0.0, answer[1] + 0.0, answer[2]
         if setting.prune:
             # Read when the next tile is solved.
-            best = np.sort(np.concatenate([best, margin[rows][np.isin(status[rows], ANSWERED)]]))[
-                -max(setting.top, 1) :
-            ]
+            known = margin[rows][certain(margin[rows], status[rows])]
+            best = np.sort(np.concatenate([best, known]))[-max(setting.top, 1) :]
             columns["cutoff"][rows.stop :] = _cutoff(best, setting.top)
         if progress is not None:
             progress(rows.stop)
