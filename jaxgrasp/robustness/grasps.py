@@ -48,7 +48,8 @@ class Grasps:
     units: jax.Array
     """(6, *lanes), what turns wrenches in N and N m to newtons: 1 and 1 / length."""
     columns: jax.Array
-    """(6, 3, n, *lanes), the blocks of G; zero where absent."""
+    """(6, k, n, *lanes), the blocks of G; zero where absent. k = 3, or 4 for soft contacts, whose moments are in newtons,
+    see `Contacts.torsional_arms`."""
     lined: jax.Array
     """bool (*lanes), all contacts are on one line, exactly: two of them always are. G has rank 5 at most."""
     wrench: jax.Array
@@ -64,7 +65,7 @@ class Grasps:
     vertex_inverse_roots: jax.Array | None
     """M for each vertex of the disturbance set, along the leading axis."""
     weight_roots: jax.Array | None
-    """(3, 3, n, *lanes), R with R'R = Q_0; None for Q_0 = I."""
+    """(k, k, n, *lanes), R with R'R = Q_0; None for Q_0 = I."""
     options: Options
     """The options of the call, lanes trailing, made safe as well."""
     actuated: Actuated | None
@@ -72,7 +73,7 @@ class Grasps:
 
     @property
     def rows(self) -> jax.Array:
-        """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
+        """(6 + r, k, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
         return stack_rows(self.columns, self.actuated)
 
 
@@ -103,12 +104,13 @@ def _run(function: BatchedFunction, data: GraspData, options: Options) -> Any:
     arguments = lay_out(data, options)
     # Roots of Q take loops over columns, which compact tiles do without.
     compact = function.tile is None and data.compliance is None and options.effort_weights is None
-    n = data.contacts.n_c
-    rows = n * (function.rows + 1)
+    n, components = data.contacts.n_c, data.contacts.components
+    # Soft contacts have twice as many facets.
+    rows = n * (function.rows * (components - 2) + 1)
     if data.actuation is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.
         joints, actuators = data.actuation.transmission.shape[-2:]
-        rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
+        rows = max(rows, math.ceil((6 + joints) * (components * n + actuators) * TILE / 12_000))
     lanes = Lanes(admit, arguments.shared, rows, compact, function.tile or LOOSE_TILE)
     out = differentiable(function, lanes, arguments.inputs)
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), out)
@@ -148,6 +150,11 @@ def admit(inputs: Inputs) -> Grasps:
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, load, 0)
     friction, max_force = (jnp.where(present, x, 1) for x in (contacts.friction, contacts.max_force))
+    arms, lined = contacts.torsional_arms, _lined(positions, present)
+    if arms is not None:
+        arms = jnp.where(present, arms, 0)
+        lined &= (arms == 0).all(0)
+        arms = arms / length
     actuated = None
     if data.actuation is not None:
         actuated = _admit_actuation(data.actuation, present, valid, length)
@@ -159,8 +166,8 @@ def admit(inputs: Inputs) -> Grasps:
         max_force=max_force,
         length=length,
         units=units,
-        columns=grasp_columns(positions / length, frames),
-        lined=_lined(positions, present),
+        columns=grasp_columns(positions / length, frames, arms),
+        lined=lined,
         wrench=wrench * units,
         reserve=jnp.where(valid, data.cone_margin, 0),
         terms=data.disturbances.terms,
@@ -178,6 +185,8 @@ def _usable_contacts(contacts: Contacts) -> jax.Array:
     usable = jnp.isfinite(contacts.positions).all(1) & rotations(contacts.frames)
     usable &= (contacts.friction >= 0) & jnp.isfinite(contacts.friction)
     usable &= (contacts.max_force > 0) & jnp.isfinite(contacts.max_force)
+    if contacts.torsional_friction is not None:
+        usable &= (contacts.torsional_friction >= 0) & jnp.isfinite(contacts.torsional_friction)
     return (usable | ~contacts.active).all(0)
 
 
@@ -204,7 +213,7 @@ def _roots_of_weights(
     if masked is None:
         return None, None, jnp.array(True)
     usable = inverse_root(masked, active.shape[0])[1]
-    definite = jnp.where(valid & usable, masked, jnp.eye(3, dtype=masked.dtype)[..., None])
+    definite = jnp.where(valid & usable, masked, jnp.eye(masked.shape[1], dtype=masked.dtype)[..., None])
     roots = linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
     return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
 
@@ -284,11 +293,11 @@ def _masked(matrices: jax.Array | None, active: jax.Array) -> jax.Array | None:
     """Blocks or full matrices of contacts with the absent ones' rows and columns replaced by the identity's."""
     if matrices is None:
         return None
-    full = matrices.shape[:2] == (3 * active.shape[0],) * 2
+    full = matrices.shape[0] != active.shape[0]
     eye = jnp.eye(matrices.shape[1], dtype=matrices.dtype).reshape(
         (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (active.ndim - 1)
     )
     if not full:
         return jnp.where(active[:, None, None], matrices, eye)
-    there = jnp.repeat(active, 3, 0)
+    there = jnp.repeat(active, matrices.shape[0] // active.shape[0], 0)
     return jnp.where(there[:, None] & there[None], matrices, eye)

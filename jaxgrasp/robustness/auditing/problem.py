@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold_last
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.friction import contact_facets
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.robustness.actuators import Actuated, clip_limits
 from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
@@ -19,6 +19,7 @@ class Problem(NamedTuple):
     """Grasps and what is asked of them; leaves (lanes, ...), or (1, ...) where all lanes share them.
 
     positions, frames, friction, max_force: as in `Contacts`; zero where a contact is absent, but for max_force, 1.
+    arms: (lanes, n), m, moments about the normals per newton of the fourth component of forces; None for hard contacts.
     present: bool (lanes, n).
     size: (lanes,), m, root-mean-square distance of the contacts from the centre of mass; 1 where that is zero.
     wrench: (lanes, 6), b, N and N m.
@@ -33,6 +34,7 @@ class Problem(NamedTuple):
     frames: jax.Array
     friction: jax.Array
     max_force: jax.Array
+    arms: jax.Array | None
     present: jax.Array
     size: jax.Array
     wrench: jax.Array
@@ -82,6 +84,7 @@ def problem_of(arguments: Arguments) -> Problem:
         frames=here(contacts.frames, 0),
         friction=friction,
         max_force=max_force,
+        arms=None if contacts.torsional_arms is None else here(contacts.torsional_arms, 0),
         present=present,
         size=largest * jnp.sqrt(jnp.where(square > 0, square, 1)),
         wrench=data.required_wrench,
@@ -135,6 +138,7 @@ def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:
     return jax.lax.dynamic_index_in_dim(blocks, turn, 1, keepdims=False)
 
 
-def facets(cone_edges: int, dtype: jnp.dtype) -> jax.Array:
-    """The facet rows (n_e, 3) for unit friction."""
-    return jnp.asarray(pyramid_facets(cone_edges), dtype)
+def facets(problem: Problem, cone_edges: int) -> jax.Array:
+    """The facet rows for unit friction: (n_e, 3), of soft contacts (2 n_e, 4)."""
+    components = 3 if problem.arms is None else 4
+    return jnp.asarray(contact_facets(cone_edges, components), problem.friction.dtype)

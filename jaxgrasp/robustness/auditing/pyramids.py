@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import fold, fold_last
 from jaxgrasp.robustness.auditing import hidden
 from jaxgrasp.robustness.auditing.problem import Hand, Problem, facets, problem_of
@@ -71,14 +72,14 @@ def judge(arguments: Arguments, solution: Solution, evidence: Evidence, anew: bo
     """
     problem, rows, place = problem_of(arguments), evidence.rows, None
     if anew:
-        rows, place = own_rows(problem, solution.cone_multipliers.shape[-1], solution.rank)
+        rows, place = own_rows(problem, edges_of(problem, solution.cone_multipliers), solution.rank)
     return _judged(problem, solution, evidence, rows, place, smooth)
 
 
 def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Array:
     """Where S_1 and S_2 are not those that the solver used, or the set does not lie where it claims, (lanes,)."""
     problem, used = problem_of(arguments), evidence.rows
-    rows, place = own_rows(problem, solution.cone_multipliers.shape[-1], solution.rank)
+    rows, place = own_rows(problem, edges_of(problem, solution.cone_multipliers), solution.rank)
     # What counts is what a row loses at the margin, or at the disturbance that takes a whole row by itself.
     force, there = problem.max_force, problem.present
     taken = jnp.maximum(_max(used.cone) / jnp.where(problem.friction > 0, problem.friction, jnp.inf), used.bound)
@@ -167,7 +168,7 @@ def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array
     """Whether G f_0 = b, and the margin that f_0 attains, -inf where a row fails that nothing disturbs; (lanes,)."""
     forces, missed = solution.forces, MISSED[solution.forces.dtype.name]
     there = problem.present
-    cone, bound = row_values(problem, forces, rows.cone.shape[-1])
+    cone, bound = row_values(problem, forces, edges_of(problem, rows.cone))
     slack = missed * problem.max_force
     spare = (slack - problem.reserve[:, None])[:, :, None] - cone
     parts = [_most(jnp.where(there[:, :, None], spare, jnp.inf), rows.cone)]
@@ -189,21 +190,30 @@ def _most(spare: jax.Array, loss: jax.Array) -> jax.Array:
     return _min(jnp.where(moved, spare / jnp.where(moved, loss, 1), still), loss.ndim - 1)
 
 
+def edges_of(problem: Problem, cone: jax.Array) -> int:
+    """n_e, from numbers of every facet (..., facets)."""
+    return cone.shape[-1] if problem.arms is None else cone.shape[-1] // 2
+
+
 def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[jax.Array, jax.Array]:
-    """C f (lanes, n, n_e) and -f_n (lanes, n)."""
-    pressed = jnp.stack([forces[..., 0], forces[..., 1], problem.friction * forces[..., 2]], -1)
-    pattern = facets(cone_edges, forces.dtype)
-    cone = fold(jnp.add, [pressed[..., a, None] * pattern[:, a] for a in range(3)])
+    """C f (lanes, n, n_e), 2 n_e of soft contacts, and -f_n (lanes, n)."""
+    moments = [forces[..., a] for a in range(3, forces.shape[-1])]
+    pressed = jnp.stack([forces[..., 0], forces[..., 1], problem.friction * forces[..., 2], *moments], -1)
+    pattern = facets(problem, cone_edges)
+    cone = fold(jnp.add, [pressed[..., a, None] * pattern[:, a] for a in range(pressed.shape[-1])])
     return cone, -forces[..., 2]
 
 
 def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = None) -> jax.Array:
     """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size; (lanes,)."""
     f, frames = forces, problem.frames
-    pushes = frames[..., 0] * f[..., :1] + frames[..., 1] * f[..., 1:2] + frames[..., 2] * f[..., 2:]
+    pushes = frames[..., 0] * f[..., :1] + frames[..., 1] * f[..., 1:2] + frames[..., 2] * f[..., 2:3]
     size = problem.size[:, None]
     wanted = problem.wrench if wrench is None else wrench
-    moments = fold(jnp.add, jnp.moveaxis(cross(problem.positions, pushes, -1), 1, 0))
+    turns = cross(problem.positions, pushes, -1)
+    if problem.arms is not None:
+        turns = turns + frames[..., 2] * (problem.arms * f[..., 3])[..., None]
+    moments = fold(jnp.add, jnp.moveaxis(turns, 1, 0))
     missing = jnp.concatenate(
         [fold(jnp.add, jnp.moveaxis(pushes, 1, 0)) - wanted[:, :3], (moments - wanted[:, 3:]) / size], -1
     )
@@ -230,21 +240,28 @@ def _driven(hand: Hand, forces: jax.Array, efforts: jax.Array) -> jax.Array:
 
 
 def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A'z + G'y, (lanes, n, 3), and the sum of the cone rows' multipliers of every contact, (lanes, n)."""
-    patterns = facets(cone.shape[-1], cone.dtype)
+    """A'z + G'y, (lanes, n, k), and the sum of the cone rows' multipliers of every contact, (lanes, n)."""
+    patterns = facets(problem, edges_of(problem, cone))
     patterns = jnp.concatenate([patterns, jnp.ones_like(patterns[:, :1])], 1)
     pull = fold(jnp.add, [cone[..., k, None] * patterns[k] for k in range(cone.shape[-1])])
     turned = y[:, None, :3] + cross(jnp.broadcast_to(y[:, None, 3:], problem.positions.shape), problem.positions, -1)
     frames = problem.frames
     along = frames[:, :, 0] * turned[..., :1] + frames[:, :, 1] * turned[..., 1:2] + frames[:, :, 2] * turned[..., 2:]
     normal = pull[..., 2] * problem.friction - bound
-    return jnp.stack([pull[..., 0], pull[..., 1], normal], -1) + along, pull[..., 3]
+    residual = jnp.stack([pull[..., 0], pull[..., 1], normal], -1) + along
+    if problem.arms is not None:
+        turn = problem.arms * (frames[..., 2] * y[:, None, 3:]).sum(-1)
+        residual = jnp.concatenate([residual, (pull[..., 3] + turn)[..., None]], -1)
+    return residual, pull[..., -1]
 
 
 def _lost(problem: Problem, residual: jax.Array) -> jax.Array:
     """The most that r'f can be for the admissible forces of every contact, (lanes, n)."""
     residual = jnp.abs(residual)
-    tangential = (residual[..., 0] + residual[..., 1]) * problem.friction
+    tangential = residual[..., 0] + residual[..., 1]
+    for a in range(3, residual.shape[-1]):
+        tangential = tangential + residual[..., a]
+    tangential = tangential * problem.friction
     return (tangential + residual[..., 2]) * problem.max_force
 
 
@@ -325,7 +342,7 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     if problem.weights is None:
         largest, weighed, answered = 1.0, forces, residual
     else:
-        weights = jnp.where(there[:, :, None, None], problem.weights, jnp.eye(3, dtype=forces.dtype))
+        weights = jnp.where(there[:, :, None, None], problem.weights, jnp.eye(forces.shape[-1], dtype=forces.dtype))
         largest = _max(jnp.abs(weights), 2)
         weighed, answered = jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
     own = 0.5 * _sum(forces * weighed)
@@ -338,7 +355,9 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
 
 
 def _divided(vectors: jax.Array, matrices: jax.Array) -> jax.Array:
-    """Q^-1 v for blocks (..., 3, 3), by their adjugates."""
+    """Q^-1 v for blocks (..., 3, 3), by their adjugates, or of another size."""
+    if matrices.shape[-1] != 3:
+        return linalg.solve_positive(matrices, vectors[..., None])[..., 0]
     a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
     adjugate = jnp.stack([cross(b, c, -1), cross(c, a, -1), cross(a, b, -1)], -1)
     return jnp.einsum("...ab,...b->...a", adjugate, vectors) / (a * adjugate[..., 0]).sum(-1)[..., None]

@@ -29,7 +29,7 @@ _DOUBTFUL = {"float64": (1e-13, 1e-6), "float32": (1e-7, 3e-3)}
 class Rows(NamedTuple):
     """What the worst unit disturbance takes from every row; lanes lead.
 
-    cone: (lanes, n, n_e), -S_1, N.
+    cone: (lanes, n, n_e), -S_1, N; 2 n_e of soft contacts.
     bound: (lanes, n), S_2, N.
     effort: (lanes, 2, n_u), of u <= u_max and -u <= -u_min; None without actuators.
     """
@@ -87,16 +87,20 @@ def _own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows,
 
 
 def own_inverse(problem: Problem) -> jax.Array:
-    """G* of wrenches in N and N m, (3 n, 6, lanes); for one compliance, or none."""
+    """G* of wrenches in N and N m, (k n, 6, lanes); for one compliance, or none."""
     rows = _stacked_rows(problem)
     inverse = _weighted(rows, problem, problem.compliance, None, echelon(rows, None))
     return inverse[:, :6] * _units(problem.size)
 
 
 def _stacked_rows(problem: Problem) -> jax.Array:
-    """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, 3 n, lanes)."""
+    """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, k n, lanes)."""
     arms = jnp.broadcast_to(problem.positions[:, :, :, None], problem.frames.shape)
     blocks = jnp.concatenate([problem.frames, cross(arms, problem.frames, 2) / problem.size[:, None, None, None]], 2)
+    if problem.arms is not None:
+        torsion = problem.frames[..., 2] * (problem.arms / problem.size[:, None])[..., None]
+        torsion = jnp.concatenate([jnp.zeros_like(torsion), torsion], -1)
+        blocks = jnp.concatenate([blocks, torsion[..., None]], -1)
     rows = jnp.moveaxis(blocks, (2, 1, 3, 0), (0, 1, 2, 3)).reshape(6, -1, blocks.shape[0])
     hand = problem.hand
     if hand is None or hand.unreached is None:
@@ -175,15 +179,15 @@ def _products(rows: jax.Array, row: jax.Array) -> jax.Array:
 def _weighted(
     rows: jax.Array, problem: Problem, compliance: jax.Array | None, rank: jax.Array | None, plain: Echelon
 ) -> jax.Array:
-    """G* (3 n, r, lanes) for a compliance with lanes leading; None for Q = I."""
+    """G* (k n, r, lanes) for a compliance with lanes leading; None for Q = I."""
     if compliance is None:
         return plain.inverse
-    n = problem.present.shape[-1]
-    there = jnp.repeat(problem.present, 3, -1)
-    if compliance.shape[-2:] != (3 * n, 3 * n):
+    n, size = problem.present.shape[-1], rows.shape[1]
+    there = jnp.repeat(problem.present, size // n, -1)
+    if compliance.shape[-2:] != (size, size):
         blocks = jnp.eye(n, dtype=rows.dtype)[:, None, :, None] * compliance[:, :, :, None, :]
-        compliance = blocks.reshape(blocks.shape[0], 3 * n, 3 * n)
-    eye = jnp.eye(3 * n, dtype=rows.dtype)
+        compliance = blocks.reshape(blocks.shape[0], size, size)
+    eye = jnp.eye(size, dtype=rows.dtype)
     sane = jnp.where(there[:, :, None] & there[:, None, :], compliance, eye)
     # M = L^-T for Q = L L'.
     half = jnp.swapaxes(linalg.inverse_root(sane), 1, 2)
@@ -192,18 +196,21 @@ def _weighted(
 
 
 def _reached(problem: Problem, inverse: jax.Array, cone_edges: int, wrench: jax.Array | None = None) -> Rows:
-    """What the set, or a single wrench (6, lanes), takes from every row, given G* (3 n, r, lanes)."""
+    """What the set, or a single wrench (6, lanes), takes from every row, given G* (k n, r, lanes)."""
     n, lanes = problem.present.shape[-1], inverse.shape[-1]
     units = _units(problem.size)
-    # (6, n, lanes) each: the rows of G* for tangents and normal.
-    first, second, normal = jnp.moveaxis(inverse[:, :6].reshape(n, 3, 6, lanes), (1, 2), (0, 1)) * units[:, None]
-    c, s, k = facets(cone_edges, inverse.dtype).T[:, :, None, None]
+    # (6, n, lanes) each: the rows of G* for tangents and normal, and for moments.
+    answers = inverse[:, :6].reshape(n, -1, 6, lanes)
+    first, second, normal, *moment = jnp.moveaxis(answers, (1, 2), (0, 1)) * units[:, None]
+    c, s, k, *pole = facets(problem, cone_edges).T[:, :, None, None]
     slip = jnp.moveaxis(problem.friction, 0, -1)
     cone = -(c * first[:, None] + s * second[:, None] + k * (slip * normal)[:, None])
+    for p, m in zip(pole, moment, strict=True):
+        cone = cone - p * m[:, None]
     parts = [cone.reshape(6, -1, lanes), normal]
     if problem.hand is not None:
         hand = problem.hand
-        torque = jnp.einsum("liav,iacl->lvc", hand.jacobian, inverse[:, :6].reshape(n, 3, 6, lanes))
+        torque = jnp.einsum("liav,iacl->lvc", hand.jacobian, answers)
         effort = jnp.einsum("luv,lvc->cul", *_alike(hand.inverse, torque)) * units[:, None]
         parts += [-effort, effort]
     directions = jnp.concatenate(parts, 1)

@@ -151,7 +151,7 @@ def build_solution(
 
 
 def _balance(grasps: Grasps, basics: Basics, rest: jax.Array, forces: jax.Array, reached: jax.Array) -> jax.Array:
-    """Whether f_0 (3, n, *lanes) supplies b and forces (n_d, 3, n, *lanes) supply b - lambda_j W_j, (*lanes).
+    """Whether f_0 (k, n, *lanes) supplies b and forces (n_d, k, n, *lanes) supply b - lambda_j W_j, (*lanes).
 
     Directions without a lambda_j above 0 do not count.
     """
@@ -191,7 +191,7 @@ def _feasibility(
 def _forces(
     basics: Basics, form: Formulation, x: jax.Array, directions: jax.Array, margin: jax.Array, program: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """f_0 (3, n, *lanes) and f_0 + delta f_j at the margin (n_d, 3, n, *lanes), N, of x (3, n, D, *lanes)."""
+    """f_0 (k, n, *lanes) and f_0 + delta f_j at the margin (n_d, k, n, *lanes), N, of x (k, n, D, *lanes)."""
     each = jnp.moveaxis(x, 2, 0) * basics.sizes
     if form.free:
         # On the way from f_0 to what bears the most that this direction allows.

@@ -16,7 +16,7 @@ from jaxgrasp.robustness.auditing.pyramids import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
-from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.interface.solution import Solution, with_moments
 from jaxgrasp.robustness.tightening.decisions import solve_effort, solve_margin
 from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
 from jaxgrasp.robustness.tightening.objectives import LeastEffort
@@ -77,7 +77,8 @@ def least_effort(
         smoothing=optional_float("smoothing", smoothing),
         effort_weights=optional_float("effort_weights", effort_weights),
     )
-    return over_grasps(_LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)[0]
+    found = over_grasps(_LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)
+    return with_moments(found[0], contacts)
 
 
 class _LeastEffort(Tightening):

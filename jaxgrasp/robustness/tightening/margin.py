@@ -15,7 +15,7 @@ from jaxgrasp.robustness.auditing.pyramids import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
-from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.interface.solution import Solution, with_moments
 from jaxgrasp.robustness.tightening.decisions import at_centre, solve_margin
 from jaxgrasp.robustness.tightening.derivatives import envelope_adjoint, is_compact, set_changes
 from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
@@ -84,7 +84,8 @@ def largest_disturbance(
     pyramid_facets(cone_edges)
     data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin, actuation)
     options = Options(smoothing=optional_float("smoothing", smoothing), cutoff=optional_float("cutoff", cutoff))
-    return over_grasps(_LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)[0]
+    found = over_grasps(_LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)
+    return with_moments(found[0], contacts)
 
 
 class _LargestDisturbance(Tightening):

@@ -42,10 +42,10 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
     dtype, asked = program.rhs.dtype, grasps.options.margin
     assert asked is not None
     margin = jnp.where(program.disturbance_outside | program.slippery, 0, asked / program.scale)
-    eye = jnp.eye(3, dtype=dtype)[..., None, None]
+    eye = jnp.eye(program.columns.shape[1], dtype=dtype)[..., None, None]
     # H = D Q_0 D = root'root with root = R D, Q_0 = R'R and the units D of forces.
     root = eye if grasps.weight_roots is None else grasps.weight_roots
-    root = root * jnp.stack([program.tangential, program.tangential, program.normal]) * blocks.present
+    root = root * program.force_units * blocks.present
     largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
     largest = jnp.where(largest > 0, largest, 1)
 
@@ -70,12 +70,12 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
 
 
 def apply_weights(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """Q_0 f of forces (n, 3, *lanes); None for the weights is Q_0 = I."""
+    """Q_0 f of forces (n, k, *lanes); None for the weights is Q_0 = I."""
     return forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
 
 
 def compute_effort(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
+    """1/2 f' Q_0 f of forces (n, k, *lanes)."""
     return 0.5 * fold(jnp.add, fold(jnp.add, forces * apply_weights(forces, weights)))
 
 

@@ -79,7 +79,7 @@ def scale_point(
     """
     usable = lambda x, other: jnp.where(point.usable, x, other)
     forces = usable(jnp.moveaxis(point.forces, 1, 0), 0) * program.present
-    x = [forces / jnp.stack([program.tangential, program.tangential, program.normal])]
+    x = [forces / program.force_units]
     z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
     z = [usable(z * program.row_units() / unit, 1) * program.present]
     if program.actuators is not None:

@@ -1,6 +1,6 @@
 """A quadratic program whose copies of small blocks meet in one of them: the form of (11).
 
-    min 1/2 x_0' H_0 x_0 + sum_j 1/2 (x_j - x_0)' H (x_j - x_0)   over x_0, x_1 .. x_J, blocks of three each, with
+    min 1/2 x_0' H_0 x_0 + sum_j 1/2 (x_j - x_0)' H (x_j - x_0)   over x_0, x_1 .. x_J, blocks of k unknowns each, with
     A x_ji <= h   and   sum_i E_i x_ji = b_j.
 
 The Newton matrix is an arrow: given x_0, the hub, the copies have nothing to do with each other. With the weights W of
@@ -16,7 +16,7 @@ E P_j^-1 E' = L_j L_j' and G_j = L_j^-1 E F_j:
 
     (P_0 - sum_j (H F_j - G_j'G_j)) dx_0 + E'dy_0 = r_0 + sum_j (H P_j^-1 r_j - G_j'L_j^-1 (E P_j^-1 r_j - q_j)).
 
-The last system, of 3 n unknowns and the equalities of the hub, is solved by inverse Cholesky factors. A step costs
+The last system, of k n unknowns and the equalities of the hub, is solved by inverse Cholesky factors. A step costs
 O(J (n + n^2) + n^3); a dense factorisation would cost O(J^3 n^3).
 
 Callers scale: |x|_inf <= 1 at admissible points, rows of E orthonormal or zero, entries of H at most 1.
@@ -33,11 +33,12 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.lanes.fence import fenced, repeat
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.small_matrices import (
-    cholesky_3x3,
+    SmallFactor,
     inverse_cholesky,
     matvec,
     matvec_transposed,
-    solve_3x3,
+    small_cholesky,
+    solve_small,
     spread_over,
     sum_over_blocks,
 )
@@ -57,37 +58,37 @@ class ArrowRecord(NamedTuple):
 class _Factors(NamedTuple):
     """The reduced Newton system, in the letters of the module's docstring."""
 
-    blocks: list[jax.Array]  # Cholesky factors of the 3x3 blocks of P_j, (n, J, *lanes)
-    follow: jax.Array  # (3, 3, n, J, *lanes), F_j
+    blocks: SmallFactor  # Cholesky factors of the k x k blocks of P_j, (n, J, *lanes)
+    follow: jax.Array  # (k, k, n, J, *lanes), F_j
     roots: jax.Array  # (eq, eq, J, *lanes), L_j^-1
-    reach: jax.Array  # (eq, 3, n, J, *lanes), G_j
-    hub: jax.Array  # (3 n, 3 n, *lanes), K, the inverse Cholesky factor of the matrix of dx_0
+    reach: jax.Array  # (eq, k, n, J, *lanes), G_j
+    hub: jax.Array  # (k n, k n, *lanes), K, the inverse Cholesky factor of the matrix of dx_0
     hub_root: jax.Array  # (eq, eq, *lanes), the inverse Cholesky factor of E K'K E'
-    hub_columns: jax.Array  # (eq, 3 n, *lanes), E K'
+    hub_columns: jax.Array  # (eq, k n, *lanes), E K'
     weights: jax.Array
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class ArrowProblem:
-    """The program for `interior_point.solve`; x is (3, n, J + 1, *lanes), x_0 last, rows (m, n, J + 1, *lanes)."""
+    """The program for `interior_point.solve`; x is (k, n, J + 1, *lanes), x_0 last, rows (m, n, J + 1, *lanes)."""
 
     patterns: jax.Array
-    """The rows A, (m, 3)."""
+    """The rows A, (m, k)."""
     h: jax.Array
     """The right-hand sides of the rows, (m, 1, 1, *1)."""
     columns: jax.Array
-    """E, (eq, 3, n, 1, *lanes); zero where a row is dropped or a block absent."""
+    """E, (eq, k, n, 1, *lanes); zero where a row is dropped or a block absent."""
     rhs: jax.Array
     """The right-hand sides b_j of the equality rows, (eq, J + 1, *lanes)."""
     dropped: jax.Array
     """A mask of the equality rows, (eq, 1, *lanes): 1 for rows that are zero, else 0."""
     hub_hessian: jax.Array
-    """The blocks of H_0, (3, 3, n, 1, *lanes)."""
+    """The blocks of H_0, (k, k, n, 1, *lanes)."""
     copy_hessian: jax.Array
-    """The blocks of H, (3, 3, n, 1, *lanes)."""
+    """The blocks of H, (k, k, n, 1, *lanes)."""
     guess: jax.Array
-    """A point to start from, (3, n, J + 1, *lanes): inside the rows, if possible."""
+    """A point to start from, (k, n, J + 1, *lanes): inside the rows, if possible."""
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -109,7 +110,7 @@ class ArrowProblem:
         return matvec_transposed(spread_over(self.patterns.T, x), x)
 
     def adjoint(self, z: jax.Array) -> jax.Array:
-        """Compute A'z, (3, n, J + 1, *lanes)."""
+        """Compute A'z, (k, n, J + 1, *lanes)."""
         return matvec_transposed(spread_over(self.patterns, z), z)
 
     def equality(self, x: jax.Array) -> jax.Array:
@@ -117,7 +118,7 @@ class ArrowProblem:
         return sum_over_blocks(self.columns * x)
 
     def pull_back(self, y: jax.Array) -> jax.Array:
-        """Compute E'y, (3, n, J + 1, *lanes)."""
+        """Compute E'y, (k, n, J + 1, *lanes)."""
         return fold(jnp.add, self.columns * y[:, None, None])
 
     def project(self, x: jax.Array) -> jax.Array:
@@ -152,7 +153,7 @@ class ArrowProblem:
 
     def factor(self, weights: jax.Array) -> _Factors:
         """Factor the Newton system: eliminate the copies' blocks, their equalities, then x_0."""
-        eq, _, n = self.columns.shape[:3]
+        eq, size = self.columns.shape[0], self.columns.shape[1] * self.columns.shape[2]
         factors, follow, matrix, across, hub = fenced(self._eliminate_copies)(weights)
 
         # Equalities of the copies: G_j = L_j^-1 E F_j, and the sum of G_j'G_j for the hub.
@@ -162,10 +163,10 @@ class ArrowProblem:
         @fenced
         def couple(roots: jax.Array, across: jax.Array, hub: jax.Array) -> tuple:
             reach = jnp.stack([fold(jnp.add, root[:, None, None] * across) for root in roots])
-            flat = jnp.swapaxes(reach, 1, 2).reshape(eq, 3 * n, -1, *self.lanes)
+            flat = jnp.swapaxes(reach, 1, 2).reshape(eq, size, -1, *self.lanes)
             whole = jnp.einsum("epj...,eqj...->pq...", flat, flat)
-            blocks = jnp.einsum("abi...,ik->iakb...", hub, jnp.eye(n, dtype=hub.dtype))
-            return reach, whole + blocks.reshape(3 * n, 3 * n, *self.lanes)
+            blocks = jnp.einsum("abi...,ik->iakb...", hub, jnp.eye(hub.shape[2], dtype=hub.dtype))
+            return reach, whole + blocks.reshape(size, size, *self.lanes)
 
         reach, whole = couple(roots, across, hub)
 
@@ -174,7 +175,7 @@ class ArrowProblem:
 
         @fenced
         def tie(inverse: jax.Array) -> tuple:
-            columns = jnp.swapaxes(self.columns[:, :, :, 0], 1, 2).reshape(eq, 3 * n, *self.lanes)
+            columns = jnp.swapaxes(self.columns[:, :, :, 0], 1, 2).reshape(eq, size, *self.lanes)
             turned = jnp.einsum("ep...,qp...->eq...", columns, inverse)
             return turned, jnp.einsum("ep...,fp...->ef...", turned, turned)
 
@@ -192,45 +193,45 @@ class ArrowProblem:
 
     def _eliminate_copies(self, weights: jax.Array) -> tuple:
         """Compute factors of P_j, F_j, E P_j^-1 E' and E F_j of the copies, and the blocks of P_0 - sum_j H F_j."""
-        eq = len(self.columns)
-        pairs = [(a, b) for a in range(3) for b in range(a + 1)]
+        eq, k = self.columns.shape[:2]
+        pairs = [(a, b) for a in range(k) for b in range(a + 1)]
         grams = [
             fold(jnp.add, spread_over(self.patterns[:, a] * self.patterns[:, b], weights) * weights) for a, b in pairs
         ]
-        factors = cholesky_3x3([g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
-        follow = jnp.stack([solve_3x3(factors, self.copy_hessian[:, b]) for b in range(3)], 1)
-        solved = jnp.stack([solve_3x3(factors, self.columns[r]) for r in range(eq)])
+        factors = small_cholesky([g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
+        follow = jnp.stack([solve_small(factors, self.copy_hessian[:, b]) for b in range(k)], 1)
+        solved = jnp.stack([solve_small(factors, self.columns[r]) for r in range(eq)])
         matrix = jnp.stack([sum_over_blocks(self.columns * solved[r]) for r in range(eq)])
         across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
-        full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(3) for b in range(3)]
-        hub = jnp.stack(full).reshape(3, 3, *full[0].shape)[:, :, :, -1:] + self.hub_hessian
+        full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(k) for b in range(k)]
+        hub = jnp.stack(full).reshape(k, k, *full[0].shape)[:, :, :, -1:] + self.hub_hessian
         # H - H P_j^-1 H of every copy, whose sum over the copies joins H_0 + A'W_0 A.
         remainder = self.copy_hessian - fold(jnp.add, jnp.moveaxis(self.copy_hessian[:, :, None] * follow[None], 1, 0))
         return factors, follow, matrix, across, (hub + _sum_copies(remainder, 3))[:, :, :, 0]
 
     def solve(self, factors: _Factors, residuals: Residuals, shift: jax.Array) -> tuple:
         """Solve the Newton system with dz = shift + weights * A dx for the directions (dx, dy, A dx)."""
-        n = self.columns.shape[2]
+        k, n = self.columns.shape[1:3]
 
         @fenced
         def newton(rhs: jax.Array, rhs_y: jax.Array) -> tuple:
             # Copies, while x_0 stays: P_j^-1 r_j and L_j^-1 (E P_j^-1 r_j - q_j).
-            first = solve_3x3(factors.blocks, rhs[:, :, :-1])
+            first = solve_small(factors.blocks, rhs[:, :, :-1])
             root_y = matvec(factors.roots, self.equality(first) - rhs_y[:, :-1])
 
             # The hub: its right-hand side, then dy_0 and dx_0.
             push = fold(jnp.add, factors.reach * root_y[:, None, None])
             right = rhs[:, :, -1:] + _sum_copies(matvec(self.copy_hessian, first) - push)
-            flat = jnp.swapaxes(right[:, :, 0], 0, 1).reshape(3 * n, *self.lanes)
+            flat = jnp.swapaxes(right[:, :, 0], 0, 1).reshape(k * n, *self.lanes)
             root_right = matvec(factors.hub, flat)
             hub_y = matvec(factors.hub_root, matvec(factors.hub_columns, root_right) - rhs_y[:, -1])
             hub_y = matvec_transposed(factors.hub_root, hub_y)
             hub = matvec_transposed(factors.hub, root_right - matvec_transposed(factors.hub_columns, hub_y))
-            hub = jnp.swapaxes(hub.reshape(n, 3, *self.lanes), 0, 1)[:, :, None]
+            hub = jnp.swapaxes(hub.reshape(n, k, *self.lanes), 0, 1)[:, :, None]
 
             # Back to the copies: dy_j and dx_j.
             copies_y = matvec_transposed(factors.roots, root_y + sum_over_blocks(factors.reach * hub))
-            copies = first + matvec(factors.follow, hub) - solve_3x3(factors.blocks, self.pull_back(copies_y))
+            copies = first + matvec(factors.follow, hub) - solve_small(factors.blocks, self.pull_back(copies_y))
             return jnp.concatenate([copies, hub], 2), jnp.concatenate([copies_y, hub_y[:, None]], 1)
 
         def improve(_: jax.Array, state: tuple) -> tuple:
@@ -291,14 +292,15 @@ def build_rows(facets: np.ndarray, dtype: jnp.dtype, axes: int) -> tuple[jax.Arr
     """Build the rows A x <= h of friction facets and of a bound on the pushing force.
 
     Args:
-        facets: (m - 1, 3), the facets' normals.
+        facets: (m - 1, k), the facets' normals.
         dtype: precision.
         axes: how many axes follow the rows.
 
     Returns:
-        A, (m, 3), and h, (m, *1).
+        A, (m, k), and h, (m, *1).
     """
-    rows = literal(np.concatenate([facets, [[0.0, 0.0, -1.0]]]), dtype)
+    bound = np.array([[0.0, 0.0, -1.0, 0.0][: facets.shape[1]]])
+    rows = literal(np.concatenate([facets, bound]), dtype)
     return rows, literal(np.array([0.0] * len(facets) + [1.0]), dtype).reshape(-1, *[1] * axes)
 
 

@@ -1,6 +1,6 @@
 """Programs of small blocks with constant row patterns, tied by a few equalities and one border column.
 
-With blocks x_i (three forces of a contact, or one bounded actuator effort), a scalar lambda and rows
+With blocks x_i (three or four forces of a contact, or one bounded actuator effort), a scalar lambda and rows
 
     A x_i + sigma_i lambda <= h_i      for every block i,
     sum_i E_i x_i = b                  (a static number of equality rows),
@@ -45,15 +45,22 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
-from jaxgrasp.solvers.small_matrices import inverse_cholesky, matvec_transposed, spread_over
+from jaxgrasp.solvers.small_matrices import (
+    inverse_cholesky,
+    matvec_transposed,
+    spread_over,
+    substitute_down,
+    substitute_up,
+)
 
 Rows = tuple[jax.Array, ...]
 
 
 class Blocks(NamedTuple):
-    """A group of n blocks of k unknowns, each with the same m rows A; lanes trail.
+    """A group of n blocks of k <= 4 unknowns, each with the same m rows A; lanes trail.
 
-    patterns: the rows A, (m, k); the last one opposes the sum of the others, so that positive multipliers balance.
+    patterns: the rows A, (m, k); the last one, of the unknown `bounded` alone, opposes the sum of the others, so that
+        positive multipliers balance.
     columns: E_i, (eq, k, n, *lanes); zero where a block is absent.
     sigma: the column of lambda, (m, n, *lanes), >= 0; zero where a block is absent.
     h: the right-hand sides, (m, n, *lanes); one where a block is absent.
@@ -69,6 +76,11 @@ class Blocks(NamedTuple):
     present: jax.Array
     hessian_root: jax.Array | None
     start: jax.Array
+
+    @property
+    def bounded(self) -> int:
+        """The unknown that the last row bounds: the third, or the last of fewer."""
+        return min(self.patterns.shape[1], 3) - 1
 
     @property
     def root(self) -> jax.Array:
@@ -90,7 +102,7 @@ class Record(NamedTuple):
 class _BlockFactor(NamedTuple):
     """The Cholesky factor L of P, and solutions with it; lists run over the k unknowns of a block."""
 
-    below: list[jax.Array]  # L10, L20, L21, each (n, *lanes)
+    below: list[jax.Array]  # L10, L20, L21 .., each (n, *lanes)
     inverse: list[jax.Array]  # 1 / diag(L), each (n, *lanes)
     columns: list[jax.Array]  # L^-1 E', each (eq, n, *lanes)
     theta: list[jax.Array]  # L^-1 p, each (n, *lanes)
@@ -142,26 +154,6 @@ def _over_blocks(x: jax.Array, axis: int) -> jax.Array:
 def least(x: jax.Array) -> jax.Array:
     """Find the smallest entry over rows and blocks, (m, n, *lanes) -> (*lanes)."""
     return fold(jnp.minimum, fold(jnp.minimum, x))
-
-
-def _substitute_down(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
-    """Compute L^-1 rhs for k <= 3; lists run over the unknowns."""
-    out: list[jax.Array] = []
-    for i, entry in enumerate(rhs):
-        for j in range(i):
-            entry = entry - below[i * (i - 1) // 2 + j] * out[j]
-        out.append(entry * inverse[i])
-    return out
-
-
-def _substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
-    """Compute L^-T rhs for k <= 3; lists run over the unknowns."""
-    out = list(rhs)
-    for i in reversed(range(len(rhs))):
-        for j in range(i + 1, len(rhs)):
-            out[i] = out[i] - below[j * (j - 1) // 2 + i] * out[j]
-        out[i] = out[i] * inverse[i]
-    return out
 
 
 @dataclass(frozen=True)
@@ -303,7 +295,7 @@ class BlockProblem(ABC):
         theta = [along[-1] for along in components] if self.bordered else []
         # The remaining column is sigma's, and its square is kappa.
         kappa = fenced(lambda w, c: fold(jnp.add, w * c * c))(weights, columns[0]) if self.bordered else None
-        reduced = fenced(lambda below, inverse: _substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
+        reduced = fenced(lambda below, inverse: substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
         return _BlockFactor(below, inverse, reduced(below, inverse), theta, kappa)
 
     def newton(self, factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
@@ -316,7 +308,7 @@ class BlockProblem(ABC):
         @fenced
         def eliminate(factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
             reduced = [
-                _substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)
+                substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)
             ]
             pairs = [
                 (c, t, a)
@@ -351,7 +343,7 @@ class BlockProblem(ABC):
                 right = [a - fold(jnp.add, c * dy[:, None]) for c, a in zip(f.columns, r, strict=True)]
                 if dlambda is not None:
                     right = [a - t * dlambda for a, t in zip(right, f.theta, strict=True)]
-                out.append(jnp.stack(_substitute_up(f.below, f.inverse, right)))
+                out.append(jnp.stack(substitute_up(f.below, f.inverse, right)))
             return tuple(out)
 
         reduced, right, pull = eliminate(factors, rhs_x, rhs_lambda, rhs_y)
