@@ -50,6 +50,7 @@ from jaxgrasp.robustness.chain.verdicts import (
     build_solution,
     select_programs,
     solve_program,
+    with_moments,
 )
 from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData
@@ -122,7 +123,7 @@ def formulation_margin(
     pyramid_facets(cone_edges)
     kernel = Chain((formulation,), cone_edges, force_bound == "norm", choose_tile(contacts, disturbances))
     solved = over_grasps(kernel, GraspData.from_arguments(contacts, disturbances, required_wrench, compliance))
-    return solved[formulation][0]
+    return with_moments(solved[formulation][0], contacts)
 
 
 def check_vertices(disturbances: DisturbanceSet) -> None:
@@ -224,7 +225,8 @@ class Chain(Audited):
             holds &= all_hold(problem, solution.disturbed_forces, wrenches, check)
         else:
             # Nothing ties the directions together but the smallest of their margins.
-            sizes = jnp.stack([problem.friction * problem.max_force] * 2 + [problem.max_force], 1)
+            sliding = problem.friction * problem.max_force
+            sizes = jnp.stack([sliding, sliding, problem.max_force, sliding][: point.x.shape[1]], 1)
             forces = jnp.moveaxis(point.x[..., :-1] * sizes[..., None], (3, 2), (1, 2))
             wrenches = disturbed_wrenches(problem, directions)
             looked_at = jnp.isfinite(directions) & (directions > 0)
@@ -273,7 +275,8 @@ class Chain(Audited):
         solutions = {}
         for name in self.names:
             twin, form = self._twin(name), FORMULATIONS[name]
-            rows = contact_rows(form.exact, self.cone_edges, self.norm_bound and form.exact, grasps.friction)
+            given = form.exact, self.cone_edges, self.norm_bound and form.exact
+            rows = contact_rows(*given, grasps.friction, len(basics.sizes))
             solution = build_solution(grasps, basics, scales[twin], rows, form, solved[twin])
             solutions[name] = solution, solved[twin].point
         return solutions

@@ -191,12 +191,12 @@ def contact_rows(
         second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch
     )
     axes = np.eye(components).tolist()
-    normal = (-np.eye(components)[2]).tolist()
+    normal = (0 - np.eye(components)[2]).tolist()
     if not exact:
         facets = contact_facets(cone_edges, components).tolist()
         return [make(False, [*facets, normal], (*[0.0] * len(facets), 1.0))]
     # Of a soft contact the ellipsoid, |(f_t, m mu / gamma)| <= -mu f_n.
-    sliding = (-np.delete(np.eye(components), 2, 0)).tolist()
+    sliding = (0 - np.delete(np.eye(components), 2, 0)).tolist()
     coulomb = make(True, [axes[2], *sliding], (0.0,) * components)
     if not norm_bound:
         return [coulomb, make(False, [normal], (1.0,))]

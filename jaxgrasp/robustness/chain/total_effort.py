@@ -10,8 +10,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, fold
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.contacts import Contacts
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.friction import contact_facets, pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.differentiable import Along, OfPyramids, Tree
 from jaxgrasp.lanes.tiles import Each
@@ -31,6 +32,7 @@ from jaxgrasp.robustness.chain.programs import FORMULATIONS, Basics, compute_bas
 from jaxgrasp.robustness.chain.verdicts import Decision, decide, select_programs, solve_program
 from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, optional_float
+from jaxgrasp.robustness.interface.solution import split
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.arrow import ArrowProblem, build_rows
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
@@ -67,6 +69,10 @@ class TotalEffortSolution:
     """`Status`."""
     iterations: Int[Array, "*batch"]
     """Interior-point steps, after those of (13)."""
+    moments: Float[Array, "*batch contacts"] | None = None
+    """The moments about the normals that come with `forces`, N m; None for hard contacts."""
+    moment_changes: Float[Array, "*batch directions contacts"] | None = None
+    """The same of `changes`."""
 
 
 def least_total_effort(
@@ -108,13 +114,25 @@ def least_total_effort(
     """
     pyramid_facets(cone_edges)
     check_vertices(disturbances)
-    if compliance is not None and jnp.shape(compliance)[-3:] != (contacts.n_c, 3, 3):
-        raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {contacts.n_c}, 3, 3)")
+    blocks = (contacts.n_c, contacts.components, contacts.components)
+    if compliance is not None and jnp.shape(compliance)[-3:] != blocks:
+        wanted = ", ".join(map(str, blocks))
+        raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {wanted})")
     data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
     options = Options(
         margin=as_float("margin", margin, ()), effort_weights=optional_float("effort_weights", effort_weights)
     )
-    return over_grasps(_TotalEffort(cone_edges, choose_tile(contacts, disturbances)), data, options)[0]
+    found = over_grasps(_TotalEffort(cone_edges, choose_tile(contacts, disturbances)), data, options)[0]
+    return found if contacts.torsional_friction is None else _split(found, contacts)
+
+
+@compiled
+def _split(found: TotalEffortSolution, contacts: Contacts) -> TotalEffortSolution:
+    """Split the forces of soft contacts, whose fourth component is m / arm, into forces and moments."""
+    forces, moments = split(found.forces, contacts)
+    each = jax.tree.map(lambda x: jnp.expand_dims(x, len(contacts.batch_shape)), contacts)
+    changes, moment_changes = split(found.changes, each)
+    return replace(found, forces=forces, moments=moments, changes=changes, moment_changes=moment_changes)
 
 
 @dataclass(frozen=True)
@@ -163,7 +181,7 @@ class _TotalEffort(OfPyramids, Audited):
         changed = {
             f.name: hidden(getattr(solution, f.name), verdicts.failed, jnp.nan)
             for f in fields(solution)
-            if f.name not in ("status", "iterations")
+            if f.name not in ("status", "iterations", "moments", "moment_changes")
         }
         status = hidden(solution.status, verdicts.failed, Status.NOT_VERIFIED)
         return replace(solution, **changed, status=status), record
@@ -238,7 +256,8 @@ def _asked(grasps: Grasps) -> jax.Array:
 def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) -> tuple[ArrowProblem, jax.Array]:
     """(11) in scaled forces, and the unit of effort."""
     dtype, present, weights = basics.sizes.dtype, grasps.present, grasps.options.effort_weights
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[..., None, None], (3, 3, *present.shape))
+    k = len(basics.sizes)
+    eye = jnp.broadcast_to(jnp.eye(k, dtype=dtype)[..., None, None], (k, k, *present.shape))
 
     def scaled(blocks: jax.Array | None) -> jax.Array:
         """D Q D."""
@@ -249,13 +268,13 @@ def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) 
     change = None
     if grasps.inverse_root is not None:
         inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.inverse_root, grasps.inverse_root)
-        compliance = linalg.solve_positive(inverse, jnp.broadcast_to(jnp.eye(3, dtype=dtype), inverse.shape))
+        compliance = linalg.solve_positive(inverse, jnp.broadcast_to(jnp.eye(k, dtype=dtype), inverse.shape))
         change = jnp.moveaxis(compliance, (0, -2, -1), (2, 0, 1))
     change = scaled(change)
     largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (rest, change)])
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     targets = jnp.concatenate([basics.load[:, None] - _asked(grasps) * basics.targets, basics.load[:, None]], 1)
-    patterns, h = build_rows(pyramid_facets(cone_edges), dtype, 3)
+    patterns, h = build_rows(contact_facets(cone_edges, k), dtype, 3)
     problem = ArrowProblem(
         patterns=patterns,
         h=h,

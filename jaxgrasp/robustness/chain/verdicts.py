@@ -1,14 +1,18 @@
 """The chain's formulations, from the outcome of their programs to solutions with bounds and statuses."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxgrasp.compiling import compiled
+from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.records import record
 from jaxgrasp.robustness.chain.programs import Basics, Formulation, Scaled
 from jaxgrasp.robustness.grasps import Grasps
+from jaxgrasp.robustness.interface.solution import split
 from jaxgrasp.solvers.conic import embedding
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
@@ -47,13 +51,32 @@ class FormulationSolution:
     contact: Int[Array, "*batch"]
     """The contact that binds: of its rows one has the largest multiplier; -1 where there is no answer."""
     row: Int[Array, "*batch"]
-    """The row of that contact: facets 0 .. n_e - 1, then the bound on the force; with exact cones 0 and 1."""
+    """The row of that contact: facets 0 .. n_e - 1 (2 n_e - 1 of soft contacts), then the bound on the force; with exact cones 0 and 1."""
     iterations: Int[Array, "*batch"]
     """Interior-point steps, the most of any direction."""
     primal_residual: Float[Array, "*batch"]
     """Largest violation of any row or equality, forces in units of f_max (mu f_max along the surface)."""
     gap: Float[Array, "*batch"]
     """(upper_bound - margin) / max(scale, margin)."""
+    moments: Float[Array, "*batch contacts"] | None = None
+    """The moments about the normals that come with `forces`, N m; None for hard contacts."""
+    disturbed_moments: Float[Array, "*batch directions contacts"] | None = None
+    """The same of `disturbed_forces`."""
+
+
+def with_moments(solution: FormulationSolution, contacts: Contacts) -> FormulationSolution:
+    """Split the forces of soft contacts, whose fourth component is m / arm, into forces and moments."""
+    return solution if contacts.torsional_friction is None else _split(solution, contacts)
+
+
+@compiled
+def _split(solution: FormulationSolution, contacts: Contacts) -> FormulationSolution:
+    forces, moments = split(solution.forces, contacts)
+    each = jax.tree.map(lambda x: jnp.expand_dims(x, len(contacts.batch_shape)), contacts)
+    disturbed = split(solution.disturbed_forces, each)
+    return replace(
+        solution, forces=forces, moments=moments, disturbed_forces=disturbed[0], disturbed_moments=disturbed[1]
+    )
 
 
 def select_programs(grasps: Grasps, basics: Basics, scaled: Scaled, free: bool) -> tuple[ConicMargin, jax.Array]:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -71,7 +72,18 @@ def with_moments(solution: Solution, contacts: Contacts) -> Solution:
 
 @compiled
 def _split(solution: Solution, contacts: Contacts) -> Solution:
+    forces, moments = split(solution.forces, contacts)
+    return replace(solution, forces=forces, moments=moments)
+
+
+def split(forces: jax.Array, contacts: Contacts) -> tuple[jax.Array, jax.Array]:
+    """Forces (*batch, n_c, 3), N, and moments (*batch, n_c), N m, of soft contacts; *batch may end in directions.
+
+    Args:
+        forces: (*batch, n_c, 4), the fourth component as m / arm.
+        contacts: the grasps, whose axes broadcast to these.
+    """
     arms = contacts.torsional_arms
     assert arms is not None
-    moments = jnp.where(contacts.active, solution.forces[..., 3] * jnp.where(contacts.active, arms, 0), 0)
-    return replace(solution, forces=solution.forces[..., :3], moments=moments)
+    moments = forces[..., 3] * jnp.where(contacts.active, arms, 0)
+    return forces[..., :3], jnp.where(contacts.active, moments, 0)
