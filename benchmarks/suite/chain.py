@@ -31,6 +31,13 @@ class Case:
     wrenches: np.ndarray
     load: np.ndarray
     edges: int = 8
+    torsional: np.ndarray | None = None
+    """(n_c,), m: soft contacts, with moments m as the fourth component m mu / gamma; None for hard ones."""
+
+    @property
+    def size(self) -> int:
+        """The number of components of a contact's force."""
+        return 3 if self.torsional is None else 4
 
     @cached_property
     def units(self) -> np.ndarray:
@@ -40,9 +47,13 @@ class Case:
 
     @cached_property
     def G(self) -> np.ndarray:
-        """(6, 3 n_c) for forces in units of f_max."""
+        """(6, size n_c) for forces in units of f_max."""
         moments = np.cross(self.positions[:, :, None], self.frames, axis=1)
-        blocks = np.concatenate([self.frames, moments], 1) * self.max_force[:, None, None]
+        blocks = np.concatenate([self.frames, moments], 1)
+        if self.torsional is not None:
+            turn = self.frames[..., 2] * (self.torsional / self.friction)[:, None]
+            blocks = np.concatenate([blocks, np.concatenate([0 * turn, turn], 1)[..., None]], 2)
+        blocks = blocks * self.max_force[:, None, None]
         return self.units[:, None] * blocks.transpose(1, 0, 2).reshape(6, -1)
 
     @cached_property
@@ -62,8 +73,8 @@ class Case:
 
     @cached_property
     def answers(self) -> np.ndarray:
-        """(n_d + 1, 3 n_c): blocking forces for one unit of lambda, then those at rest; Q = I in newtons."""
-        weights = np.repeat(self.max_force, 3)
+        """(n_d + 1, size n_c): blocking forces for one unit of lambda, then those at rest; Q = I in newtons."""
+        weights = np.repeat(self.max_force, self.size)
         G = self.G / weights
         U, s, V = np.linalg.svd(G, full_matrices=False)
         keep = s > RANK_TOLERANCE * s[0]
@@ -87,26 +98,30 @@ class Case:
 
     @cached_property
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_c (n_e + 1), 3 n_c) and right-hand sides: pyramids, then the bound on the normal force."""
+        """Rows and right-hand sides of every contact: the pyramid or, with moments, two; then the bound."""
         angles = np.pi * (2 * np.arange(self.edges) + 1) / self.edges
         blocks = []
         for mu in self.friction:
             facets = np.stack(
                 [np.cos(angles), np.sin(angles), np.full(self.edges, mu * np.cos(np.pi / self.edges))], -1
             )
-            blocks.append(np.vstack([facets, [[0, 0, -1.0]]]))
-        return sp.block_diag(blocks).toarray(), np.tile([0.0] * self.edges + [1.0], len(self.friction))
+            if self.torsional is not None:
+                pole = np.full((self.edges, 1), np.cos(np.pi / self.edges))
+                facets = np.vstack([np.hstack([facets, pole]), np.hstack([facets, -pole])])
+            blocks.append(np.vstack([facets, -np.eye(self.size)[2:3]]))
+        sides = np.append(np.zeros(len(blocks[0]) - 1), 1.0)
+        return sp.block_diag(blocks).toarray(), np.tile(sides, len(self.friction))
 
     def cones(self, norm_bound: bool) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """(kind, A, h) with h - A f in the cone: kind "q" second-order, "l" non-negative; a contact after the other."""
         n, parts = len(self.friction), []
         for i, mu in enumerate(self.friction):
-            e = np.eye(3 * n)[3 * i : 3 * i + 3]
-            parts.append(("q", np.stack([mu * e[2], -e[0], -e[1]]), np.zeros(3)))
+            e = np.eye(self.size * n)[self.size * i : self.size * (i + 1)]
+            parts.append(("q", np.vstack([mu * e[2], -np.delete(e, 2, 0)]), np.zeros(self.size)))
             if norm_bound:
-                parts.append(("q", np.vstack([np.zeros((1, 3 * n)), -e]), np.array([1.0, 0, 0, 0])))
+                parts.append(("q", np.vstack([0 * e[:1], -e[:3]]), np.array([1.0, 0, 0, 0])))
             else:
-                parts.append(("l", -e[2:], np.ones(1)))
+                parts.append(("l", -e[2:3], np.ones(1)))
         return parts
 
 
@@ -271,20 +286,22 @@ class Batch:
     max_force: np.ndarray
     wrenches: np.ndarray
     load: np.ndarray
+    torsional: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def __getitem__(self, rows) -> Batch:
-        return Batch(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Batch(**{name: None if value is None else value[rows] for name, value in given.items()})
 
     def case(self, i: int, edges: int = 8) -> Case:
         """One of them."""
         wrenches = self.wrenches[i]
         wrenches = wrenches[np.any(wrenches != 0, -1)]
-        return Case(
-            self.positions[i], self.frames[i], self.friction[i], self.max_force[i], wrenches, self.load[i], edges
-        )
+        torsional = None if self.torsional is None else self.torsional[i]
+        given = self.positions[i], self.frames[i], self.friction[i], self.max_force[i]
+        return Case(*given, wrenches, self.load[i], edges, torsional)
 
 
 def _units(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -377,7 +394,7 @@ def recorded() -> Batch | None:
 def least_total_effort(case: Case, margin: float) -> float:
     """(11) with Q = Q_0 = I, N^2; inf where infeasible, nan where Clarabel fails."""
     (A, h), size, count = case.rows, case.G.shape[1], len(case.W)
-    weights = np.repeat(case.max_force, 3) ** 2
+    weights = np.repeat(case.max_force, case.size) ** 2
     # Unknowns f_0, then the changes.
     rows = sp.vstack(
         [

@@ -212,8 +212,9 @@ def test_compliances_and_weights_are_those_of_forces_and_moments():
     there = np.concatenate([np.ones((*arms.shape, 3)), arms[..., None]], -1)
     turned = Q * there[..., None] * there[..., None, :]
     turned[..., 3, 3] += there[..., 3] == 0
-    given, loads = dict(zip(("contacts", "disturbances"), data, strict=False)), dict(
-        required_wrench=data[2], cone_margin=data[3]
+    given, loads = (
+        dict(zip(("contacts", "disturbances"), data, strict=False)),
+        dict(required_wrench=data[2], cone_margin=data[3]),
     )
     blocks = jg.largest_disturbance(**given, **loads, compliance=jnp.asarray(Q))
     n = torsional.shape[1]
