@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import jax
@@ -267,10 +268,8 @@ def test_torsional_friction_is_combined_as_in_mujoco(pad, cube, rest, gamma):
 @pytest.mark.parametrize("engine", ["mujoco", "distance"])
 def test_joints_turn_soft_contacts_as_in_mujoco(engine):
     """Fingers that turn about the normals at their tips, against MuJoCo's Jacobians; torques are those of both."""
-    hinge = '<body name="f{0}" pos="{1} {2} 0" gravcomp="1"><joint name="h{0}" type="hinge" axis="1 2 3"/>'
-    xml = four_pads(pad='condim="4"', cube='friction="0.7 0.03 0"')
-    for k, (x, y) in enumerate([(0.065, 0), (-0.065, 0), (0, 0.065), (0, -0.065)]):
-        xml = xml.replace(f'<body name="f{k}" pos="{x} {y} 0" gravcomp="1">', hinge.format(k, x, y))
+    hinge = r'\g<0><joint name="h\1" type="hinge" axis="1 2 3"/>'
+    xml = re.sub(r'<body name="f(\d)" [^>]*>', hinge, four_pads(pad='condim="4"', cube='friction="0.7 0.03 0"'))
     model = mujoco.MjModel.from_xml_string(xml)
     hand, data = HandObject.from_mjcf(model, "object"), mujoco.MjData(model)
     qpos = model.qpos0.copy()
