@@ -47,8 +47,8 @@ class Grasp:
     cone_edges: int = 8
     cone_margin: float = 0.0
     torsional: np.ndarray | None = None
-    """(n_c,), metres; None for hard contacts. Moments about the normals are a fourth component, in newtons: m mu / gamma.
-    So compliances and weights weigh them."""
+    """(n_c,), metres; None for hard contacts. Moments m about the normals are a fourth component, m mu / gamma, N,
+    which compliances and weights weigh."""
 
     @property
     def components(self) -> int:
@@ -134,7 +134,7 @@ def facet_rows(friction: float, edges: int) -> np.ndarray:
 
 
 def soft_facet_rows(friction: float, edges: int) -> np.ndarray:
-    """(2 edges, 4) rows of the polytope with the edges of the pyramid and two poles of pure torsion, moments in newtons.
+    """(2 edges, 4) rows of the polytope with the edges of the pyramid and two poles of pure torsion, moments in N.
 
     Every facet holds two neighbouring edges and a pole: it is what no edge and no pole exceeds.
     """
@@ -143,7 +143,9 @@ def soft_facet_rows(friction: float, edges: int) -> np.ndarray:
     rows = []
     for sign in (1.0, -1.0):
         for k in range(edges):
-            corners = np.stack([edge[k], edge[(k + 1) % edges], [0.0, 0.0, -1.0, sign * friction], [0.0, 0.0, -1.0, 0.0]])
+            corners = np.stack(
+                [edge[k], edge[(k + 1) % edges], [0.0, 0.0, -1.0, sign * friction], [0.0, 0.0, -1.0, 0.0]]
+            )
             # Zero at the corners, and below zero inside.
             row = np.linalg.solve(corners, [0.0, 0.0, 0.0, -1.0])
             rows.append(row / np.linalg.norm(row[:2]))
@@ -300,7 +302,7 @@ def least_effort(grasp: Grasp, margin: float, weights: np.ndarray | None = None)
 
 
 def row_violation(grasp: Grasp, forces: np.ndarray, margin: float) -> float:
-    """How far (n_c, 3) forces, (n_c, 4) with moments in newtons, overstep the rows of (21) at the given margin, as a share of f_max."""
+    """How far (n_c, 3) forces, (n_c, 4) with moments in newtons, overstep (21)'s rows at the margin, by f_max."""
     S_1, S_2 = worst_case(grasp)
     f, F = forces.reshape(-1), grasp.max_force
     cone = (grasp.cone_matrix @ f - S_1 * margin + grasp.cone_margin) / np.repeat(F, len(S_1) // len(F))

@@ -98,8 +98,9 @@ class Candidates:
 def concatenate(parts: Sequence[Candidates]) -> Candidates:
     """Puts candidates of several sources one after the other.
 
-    Sources with fewer contacts are padded with absent ones, and contacts of those without torsional friction are hard. A travelling column that a source lacks is filled with NaN
-    (numbers and booleans become float64) or with empty strings.
+    Sources with fewer contacts are padded with absent ones; contacts of those without torsional friction are hard. A
+    travelling column that a source lacks is filled with NaN (numbers and booleans become float64) or with empty
+    strings.
 
     Args:
         parts: Candidates that all give normals or all give frames.

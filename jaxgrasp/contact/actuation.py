@@ -26,8 +26,8 @@ class Actuation:
     """
 
     jacobian: Float[Array, "*batch contacts k joints"]
-    """J, velocity of each contact point on the hand in its contact frame, per unit of joint velocity; m/rad or 1. k = 3;
-    for soft contacts 4, with the angular velocity about the normal, rad/rad or rad/m."""
+    """J, velocity of each contact point on the hand in its contact frame, per unit of joint velocity; m/rad or 1. k =
+    3; for soft contacts 4, with the angular velocity about the normal, rad/rad or rad/m."""
     transmission: Float[Array, "*batch joints actuators"]
     """B, joint torque or force per unit of effort."""
     lower: Float[Array, "*batch actuators"]
@@ -59,7 +59,9 @@ class Actuation:
         """
         jacobian = as_float("jacobian", jacobian, ("n_c", "3 or 4", "n_v"))
         if jacobian.shape[-2] not in (3, 4):
-            raise ValueError(f"jacobian: got shape {jacobian.shape}, wanted (*batch, n_c, 3, n_v), or 4 for soft contacts")
+            raise ValueError(
+                f"jacobian: got shape {jacobian.shape}, wanted (*batch, n_c, 3, n_v), or 4 for soft contacts"
+            )
         joints, dtype = jacobian.shape[-1], jacobian.dtype
         given = as_float("transmission", transmission, (joints, "n_u"))
         lower, upper = (

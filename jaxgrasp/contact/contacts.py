@@ -6,6 +6,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -161,7 +162,7 @@ class Contacts:
 
     @property
     def torsional_arms(self) -> Float[Array, "*batch contacts"] | None:
-        """gamma / mu, m, None for hard contacts: moments m count as tangential forces m / arm, N.
+        """The lengths gamma / mu, m, None for hard contacts: moments m count as tangential forces m / arm, N.
 
         These use up as much of the friction, since |f_t|^2 + (m / arm)^2 <= mu^2 f_n^2. 0 where there is no friction.
         """
@@ -182,7 +183,7 @@ _LONGEST = 0.5
 
 def _doubt_ratios(torsional_friction: jax.Array) -> None:
     """Warn of coefficients that are no lengths of fingertips, where they are known."""
-    if isinstance(torsional_friction, jax.core.Tracer) or not is_direct([torsional_friction]):
+    if isinstance(torsional_friction, Tracer) or not is_direct([torsional_friction]):
         return
     largest = float(np.max(np.asarray(torsional_friction), initial=0))
     if largest > _LONGEST:

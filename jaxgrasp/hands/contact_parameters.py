@@ -90,7 +90,9 @@ def _combined(model: mujoco.MjModel, a: int, b: int) -> ContactParameters:
         rows = [a if model.geom_priority[a] > model.geom_priority[b] else b]
     sliding, twisting, _ = model.geom_friction[rows].max(0)
     margin = model.geom_margin[[a, b]].sum()
-    return _parameters(np.array([sliding, sliding, twisting]), margin, model.geom_condim[rows].max(), *_solver(model, rows))
+    return _parameters(
+        np.array([sliding, sliding, twisting]), margin, model.geom_condim[rows].max(), *_solver(model, rows)
+    )
 
 
 def _solver(model: mujoco.MjModel, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:

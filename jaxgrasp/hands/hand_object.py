@@ -14,7 +14,6 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, frames_from_normals
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts
@@ -33,7 +32,7 @@ from jaxgrasp.hands.contact_parameters import hand_object_pairs, warn_of_simplif
 from jaxgrasp.hands.couplings import Couplings, held_by_welds, read_couplings
 from jaxgrasp.hands.distance_engine import DistanceEngine
 from jaxgrasp.hands.engines import Engine, engine_for
-from jaxgrasp.hands.grasps import HandGrasps
+from jaxgrasp.hands.grasps import HandGrasps, contact_compliance
 from jaxgrasp.hands.kinematics import BALL, HINGE, SLIDE, Kinematics, Poses
 from jaxgrasp.hands.link_contacts import ContactRule, RawPoints
 from jaxgrasp.hands.mechanics import Mechanics, point_velocities
@@ -271,19 +270,7 @@ class HandObject:
         if soft:
             raise ValueError(f"compliance: actuators {', '.join(soft)} have no stiffness; wanted position servos")
         stiffness = as_float("tip_stiffness", tip_stiffness, ())
-        jacobian = grasps.actuation.jacobian
-        size = jacobian.shape[-2]
-        tall = jacobian.reshape(*jacobian.shape[:-3], size * jacobian.shape[-3], jacobian.shape[-1])
-        tips = jnp.broadcast_to(1 / stiffness, jacobian.shape[:-2]) if stiffness.ndim == 0 else 1 / stiffness
-        tips = jnp.broadcast_to(jnp.repeat(tips, size, -1), tall.shape[:-1])
-        arms = grasps.contacts.torsional_arms
-        if arms is not None:
-            # Where a contact bears no moment any number will do.
-            turning = jnp.where(arms > 0, 1 / jnp.where(arms > 0, arms, 1) ** 2, 1)
-            weights = jnp.concatenate([jnp.ones((*arms.shape, 3), arms.dtype), turning[..., None]], -1)
-            tips = tips * weights.reshape(*arms.shape[:-1], -1)
-        reached = tall @ linalg.pinv(grasps.joint_stiffness, 1e-9) @ jnp.swapaxes(tall, -1, -2)
-        return reached + tips[..., None] * jnp.eye(tall.shape[-2], dtype=tall.dtype)
+        return contact_compliance(grasps.contacts, grasps.actuation.jacobian, grasps.joint_stiffness, stiffness)
 
     @property
     def slot_links(self) -> np.ndarray:

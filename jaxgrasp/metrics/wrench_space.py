@@ -30,8 +30,8 @@ class WrenchSpace:
     """
 
     cone_edges: int = field(default=8, metadata={"static": True})
-    """n_e, edges of each pyramid, at angles 2 pi k / n_e from t1 on Coulomb's cone; a soft contact has two more, of pure
-    torsion +-gamma about its normal."""
+    """n_e, edges of each pyramid, at angles 2 pi k / n_e from t1 on Coulomb's cone; a soft contact has two more,
+    of pure torsion +-gamma about its normal."""
     unit_edges: bool = field(default=False, metadata={"static": True})
     """Edges have norm 1 (as in FRoGGeR); else their normal component is 1 (as Ferrari and Canny have it)."""
     length: ArrayLike | None = None
@@ -45,21 +45,21 @@ class Edges(NamedTuple):
     """Wrenches of all edges, harmless where they cannot be used."""
 
     wrenches: jax.Array
-    """(*batch, n_c, n_e, 6), force and moment / length of a finger that pushes along the edge; zero where absent. Of soft
-    contacts (*batch, n_c, n_e + 2, 6)."""
+    """(*batch, n_c, n_e, 6), force and moment / length of a finger that pushes along the edge; zero where absent. Of
+    soft contacts (*batch, n_c, n_e + 2, 6)."""
     present: jax.Array
     """(*batch, n_c), bool."""
     valid: jax.Array
     """(*batch,), bool; other grasps have no contact present."""
     grasp_map: jax.Array
-    """(*batch, n_c, 6, k), blocks of G, moments / length; zero where absent. k = 3, or 4 with a column for the moment m as
-    the force m mu / gamma."""
+    """(*batch, n_c, 6, k), blocks of G, moments / length; zero where absent. k = 3, or 4 with a column for the moment m
+    as the force m mu / gamma."""
     length: jax.Array
     """(*batch,), m."""
     forces: jax.Array
     """(*batch, n_c, n_e, k), the edges in contact frames."""
     soft: jax.Array | None
-    """(*batch, n_c), bool, which contacts bear moments; the two last edges of others do not count. None for hard ones."""
+    """(*batch, n_c), bool, which contacts bear moments; the last two edges of others do not count. None: hard ones."""
 
     @property
     def flat(self) -> jax.Array:
@@ -86,8 +86,9 @@ def edge_wrenches(contacts: Contacts, space: WrenchSpace | None = None) -> Float
         space: conventions; `WrenchSpace()` where None.
 
     Returns:
-        (*batch, n_c, n_e, 6), of soft contacts (*batch, n_c, n_e + 2, 6), forces as multiples of the normal force (or of the whole, with `unit_edges`) and moments
-        divided by the length; zero for absent contacts, NaN for grasps whose data are not admissible.
+        (*batch, n_c, n_e, 6), of soft contacts (*batch, n_c, n_e + 2, 6), forces as multiples of the normal force (or
+        of the whole, with `unit_edges`) and moments divided by the length; zero for absent contacts, NaN for grasps
+        whose data are not admissible.
 
     Raises:
         ValueError: options or shapes that do not fit.
@@ -150,6 +151,7 @@ def _edges(contacts: Contacts, space: WrenchSpace) -> Edges:
     blocks = jnp.concatenate([frames, jnp.swapaxes(moments, -1, -2)], -2)
     soft = None
     if contacts.torsional_friction is not None:
+        assert contacts.torsional_arms is not None
         lever = jnp.where(present, contacts.torsional_arms, 0) / length[..., None]
         soft = lever > 0
         turn = lever[..., None] * frames[..., 2]

@@ -66,7 +66,7 @@ def candidates_of(
         found |= {
             name: np.broadcast_to(x[:1], (count, *x.shape[1:])) for name, x in found.items() if name in _TRANSMISSION
         }
-    contacts = {name: found.pop(name, None) for name in _CONTACTS}
+    contacts = {name: found.pop(name) for name in _CONTACTS if name in found}
     own = {name: found.pop(name) for name in ("touching", "left_out", "penetration")} | {"qpos": qpos}
     return Candidates(
         **contacts,

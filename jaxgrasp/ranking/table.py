@@ -28,7 +28,8 @@ def ranking_table(ranking: Ranking, ranks: slice = slice(None)) -> dict[str, np.
         Arrays with a leading axis of N by name: rank; source and index, the file and the row in it; margin and
         upper_bound, multiples of the disturbance set; status; other metrics that were asked for; effort, N^2, and
         forces (N, n_c, 3), N, on the object in its frame, NaN for all but the best, like the moments (N, n_c) of soft
-        contacts, N m, about their normals, and the controls (N, n_u) of a hand; mass where any is known; and what travelled along, with `input_` before a name that the table has itself.
+        contacts, N m, about their normals, and the controls (N, n_u) of a hand; mass where any is known; and what
+        travelled along, with `input_` before a name that the table has itself.
     """
     table = _columns(ranking, ranks)
     return table | {name: names[table[name]] for name, names in _names(ranking).items()}

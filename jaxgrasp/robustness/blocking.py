@@ -85,7 +85,7 @@ def weighted_pseudo_inverse(
 
 
 def _units(contacts: Contacts) -> jax.Array | None:
-    """What turns the four components of soft contacts from newtons to N and N m, (*batch, n_c, 4); None for hard ones."""
+    """What turns the components of soft contacts from newtons to N and N m, (*batch, n_c, 4); None for hard ones."""
     if contacts.torsional_arms is None:
         return None
     arms = jnp.where(contacts.active, contacts.torsional_arms, 0)[..., None]

@@ -48,8 +48,8 @@ class Grasps:
     units: jax.Array
     """(6, *lanes), what turns wrenches in N and N m to newtons: 1 and 1 / length."""
     columns: jax.Array
-    """(6, k, n, *lanes), the blocks of G; zero where absent. k = 3, or 4 for soft contacts, whose moments are in newtons,
-    see `Contacts.torsional_arms`."""
+    """(6, k, n, *lanes), the blocks of G; zero where absent. k = 3, or 4 for soft contacts, whose moments are in
+    newtons, see `Contacts.torsional_arms`."""
     lined: jax.Array
     """bool (*lanes), all contacts are on one line, exactly: two of them always are. G has rank 5 at most."""
     wrench: jax.Array

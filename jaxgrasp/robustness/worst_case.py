@@ -47,8 +47,8 @@ def worst_case(
         cone_edges: n_e.
 
     Returns:
-        S_1 <= 0 (*batch, n_c, n_e), 2 n_e of soft contacts, N, and S_2 >= 0 (*batch, n_c), N; zero for absent contacts, NaN where the data are
-        not admissible.
+        S_1 <= 0 (*batch, n_c, n_e), 2 n_e of soft contacts, N, and S_2 >= 0 (*batch, n_c), N; zero for absent contacts,
+        NaN where the data are not admissible.
 
     Raises:
         ValueError: shapes or options that do not fit.

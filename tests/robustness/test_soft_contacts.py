@@ -1,4 +1,4 @@
-"""Soft fingertips: a moment about the normal that shares the friction, in (21), (22), S_1, S_2 and what belongs to them."""
+"""Soft fingertips: a moment about the normal that shares the friction, in (21), (22), S_1, S_2 and G*."""
 
 from __future__ import annotations
 

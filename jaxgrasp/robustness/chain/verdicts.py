@@ -51,7 +51,8 @@ class FormulationSolution:
     contact: Int[Array, "*batch"]
     """The contact that binds: of its rows one has the largest multiplier; -1 where there is no answer."""
     row: Int[Array, "*batch"]
-    """The row of that contact: facets 0 .. n_e - 1 (2 n_e - 1 of soft contacts), then the bound on the force; with exact cones 0 and 1."""
+    """The row of that contact: facets 0 .. n_e - 1 (2 n_e - 1 of soft contacts), then the bound on the force; with
+    exact cones 0 and 1."""
     iterations: Int[Array, "*batch"]
     """Interior-point steps, the most of any direction."""
     primal_residual: Float[Array, "*batch"]

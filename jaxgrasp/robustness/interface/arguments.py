@@ -211,7 +211,7 @@ def lay_out(data: GraspData, options: Options) -> Arguments:
 
 
 def moments_in_newtons(data: GraspData, options: Options) -> tuple[GraspData, Options]:
-    """Turn matrices that are given for forces and moments (f_t1, f_t2, f_n, m) into those for (f_t1, f_t2, f_n, m / arm).
+    """Turn matrices for forces and moments (f_t1, f_t2, f_n, m) into those for (f_t1, f_t2, f_n, m / arm).
 
     So all components are newtons, and moments count as much as the tangential forces that use up as much friction. That
     is also what no compliance, or no weights, stand for; MuJoCo's contacts are as stiff. Where a contact bears no

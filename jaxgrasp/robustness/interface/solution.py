@@ -53,7 +53,7 @@ class Solution:
     joint_multipliers: Float[Array, "*batch joints"] | None = None
     """y of J'f_0 - B u = 0."""
     moments: Float[Array, "*batch contacts"] | None = None
-    """The moments of the fingers on the object about the normals (right-handed about n), N m; None for hard contacts."""
+    """The moments of the fingers on the object about the normals n, right-handed, N m; None for hard contacts."""
 
     def forces_in_object_frame(self, contacts: Contacts) -> Float[Array, "*batch contacts 3"]:
         """Forces of the fingers on the object in the object frame, N.

@@ -56,7 +56,7 @@ class ScaledProgram:
     columns: jax.Array
     """(eq, k, n, *lanes), the orthonormal equality rows, those of G and of J'f - B u; zero where dropped or absent."""
     sigma: jax.Array
-    """(m, n, *lanes), m = n_e + 1 (soft contacts: 2 n_e + 1), what the disturbances take from the rows of C and E, scaled."""
+    """(m, n, *lanes), what the disturbances take from the rows, scaled; m = n_e + 1, of soft contacts 2 n_e + 1."""
     h: jax.Array
     """(m, n, *lanes), right-hand sides."""
     present: jax.Array
@@ -125,7 +125,7 @@ class ScaledProgram:
 
     @property
     def force_units(self) -> jax.Array:
-        """The units of scaled forces, (k, n, *lanes), N: along the surface, and of moments, mu F; along the normal F."""
+        """The units of scaled forces, (k, n, *lanes), N: along the normal F, along the surface and of moments mu F."""
         return force_units(self.tangential, self.normal, self.columns.shape[1])
 
     def forces(self, x: jax.Array) -> jax.Array:

@@ -307,9 +307,7 @@ class BlockProblem(ABC):
         # Eliminate the blocks: L^-1 r_x, E P^-1 r_x - r_y and r_lambda - p'P^-1 r_x.
         @fenced
         def eliminate(factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
-            reduced = [
-                substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)
-            ]
+            reduced = [substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)]
             pairs = [
                 (c, t, a)
                 for f, r in zip(factors.blocks, reduced, strict=True)

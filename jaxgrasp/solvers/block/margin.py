@@ -80,7 +80,10 @@ class MarginProblem(BlockProblem):
                 slack = jnp.where(g.present > 0, jnp.maximum(slack, floor), 1)
                 along = slice(g.bounded, g.bounded + 1)
                 balance = jnp.concatenate(
-                    [jnp.ones(slack.shape[0] - 1, slack.dtype), -jnp.sum(g.patterns[:-1, along], 0) / g.patterns[-1, along]]
+                    [
+                        jnp.ones(slack.shape[0] - 1, slack.dtype),
+                        -jnp.sum(g.patterns[:-1, along], 0) / g.patterns[-1, along],
+                    ]
                 )
                 mean = fold(jnp.add, slack[:-1]) / (slack.shape[0] - 1)
                 s.append(slack)
