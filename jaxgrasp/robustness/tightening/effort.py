@@ -47,7 +47,7 @@ def least_effort(
         required_wrench: b (*batch, 6), N and N m; None is zero.
         compliance: Q, as in `largest_disturbance`.
         effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the
-            identity.
+            identity. For soft contacts (*batch, n_c, 4, 4), as the compliance.
         cone_edges: n_e.
         cone_margin: d (*batch,), N, >= 0.
         smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the

@@ -51,7 +51,8 @@ def largest_disturbance(
         disturbances: the set D; without batch axes it is shared by all grasps.
         required_wrench: b (*batch, 6), N and N m, see `required_wrench`; None is zero.
         compliance: Q of (14), contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3), full
-            (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity.
+            (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity. For soft contacts 4 in place of
+            3, with moments fourth (rad/(N m)); None then counts a moment m as the force m mu / gamma.
         cone_edges: n_e, edges of the friction pyramid, which is inscribed in Coulomb's cone.
         cone_margin: d (*batch,), N, >= 0: what every facet row keeps in reserve.
         smoothing: kappa (*batch,), > 0, in units of the margin: answer with the central point, where s z = kappa in
