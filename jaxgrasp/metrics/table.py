@@ -16,7 +16,7 @@ from jaxgrasp.metrics.matrices import closure_residual, isotropy, smallest_singu
 from jaxgrasp.metrics.task import task_wrench
 from jaxgrasp.metrics.wrench_space import WrenchSpace
 from jaxgrasp.robustness import largest_disturbance
-from jaxgrasp.robustness.chain.formulations import formulation_margin
+from jaxgrasp.robustness.chain.formulations import formulation_margin, is_refined
 from jaxgrasp.solvers.status import Status
 
 
@@ -48,7 +48,13 @@ class Metric:
     """(*batch,) of a batch, or a float of one grasp."""
     batched: bool = True
     """Whether it takes a batch under `jax.jit`."""
+    formulation: str | None = None
+    """The formulation of `formulation_margin` whose margin it is."""
     larger_is_better: bool = True
+
+    def under_jit(self, disturbances: DisturbanceSet) -> bool:
+        """Whether it takes a batch under `jax.jit` with this set."""
+        return self.batched and (self.formulation is None or not is_refined(disturbances, self.formulation))
 
 
 def _margin(contacts: Contacts, setting: Setting) -> jax.Array:
@@ -84,19 +90,26 @@ METRICS = {
     metric.name: metric
     for metric in (
         Metric(name="margin", about="robustness margin (21)", value=_margin),
-        Metric(name="margin_12", about="largest disturbance by (12)", value=_margin_of("12")),
-        Metric(name="margin_12_fixed", about="by (12) with blocking forces", value=_margin_of("12_fixed")),
-        Metric(name="margin_13", about="by (13)", value=_margin_of("13")),
-        Metric(name="margin_16", about="by (16)", value=_margin_of("16")),
+        Metric(name="margin_12", about="largest disturbance by (12)", value=_margin_of("12"), formulation="12"),
+        Metric(
+            name="margin_12_fixed",
+            about="by (12) with blocking forces",
+            value=_margin_of("12_fixed"),
+            formulation="12_fixed",
+        ),
+        Metric(name="margin_13", about="by (13)", value=_margin_of("13"), formulation="13"),
+        Metric(name="margin_16", about="by (16)", value=_margin_of("16"), formulation="16"),
         Metric(
             name="margin_per_direction",
             about="the smallest over the directions, each with forces of its own",
             value=_margin_of("per_direction"),
+            formulation="per_direction",
         ),
         Metric(
             name="margin_per_direction_prestrained",
             about="the same with blocking forces",
             value=_margin_of("per_direction_prestrained"),
+            formulation="per_direction_prestrained",
         ),
         Metric(
             name="ferrari_canny",

@@ -8,8 +8,9 @@ from jaxgrasp.arrays import broadcast_batch, safe_norm
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
-from jaxgrasp.disturbance.vertices import Vertices
+from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.metrics.wrench_space import WrenchSpace, checked, edges_of
+from jaxgrasp.robustness.chain.members import polytope_of
 from jaxgrasp.solvers import solve_qp
 from jaxgrasp.solvers.status import Status
 
@@ -30,7 +31,7 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
 
     Args:
         contacts: the grasps.
-        task: wrenches by vertices, about the centre of mass; zero ones do not count.
+        task: wrenches by vertices, or a box, about the centre of mass; zero wrenches do not count.
         space: conventions; `WrenchSpace()` where None.
 
     Returns:
@@ -41,13 +42,13 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
         ValueError: a set that is not given by vertices, options or shapes that do not fit.
     """
     space = checked(contacts, space)
-    terms = task.terms
-    if len(terms) != 1 or not isinstance(terms[0], Vertices) or terms[0].width is not None:
+    polytope = polytope_of(task)
+    if polytope is None:
         raise ValueError(
-            "task: got a set without vertices, wanted DisturbanceSet.vertices or DisturbanceSet.forces "
-            "(--disturbances forces or a FILE)"
+            "task: got a set without vertices, wanted DisturbanceSet.vertices, forces or a box "
+            "(--disturbances forces, box or a FILE)"
         )
-    return _scaled(contacts, terms[0].wrenches, space)
+    return _scaled(contacts, wrenches_of(polytope.terms), space)
 
 
 @compiled

@@ -12,7 +12,7 @@ from jaxgrasp.candidates import Candidates
 from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.metrics import METRICS, Setting
-from jaxgrasp.ranking.tiles import columns_of, contacts_of, solve_in_tiles
+from jaxgrasp.ranking.tiles import columns_of, contacts_of, load_of, solve_in_tiles
 
 # Dense programs of all candidates of a tile are solved at once, some tens of kilobytes each.
 _TILE = 1024
@@ -58,11 +58,19 @@ def score(
     check_metrics([name])
     report = progress or (lambda _: None)
     columns, values = columns_of(candidates), np.empty(len(candidates))
-    if METRICS[name].batched:
+    if METRICS[name].under_jit(disturbances):
         settings = {"gravity": gravity, "cone_edges": cone_edges, "tile": None if name == "margin" else _TILE}
         for rows, value in solve_in_tiles(_scorer(name, cone_edges), columns, disturbances, **settings):
             values[rows] = value + 0.0  # minus zero is zero
             report(rows.stop)
+        return values
+    if METRICS[name].batched:
+        for start in range(0, len(values), _TILE):
+            some = {key: column[start : start + _TILE] for key, column in columns.items()}
+            task = {"required_wrench": load_of(some, gravity)}
+            setting = Setting(disturbances=disturbances, cone_edges=cone_edges, task=task)
+            values[start : start + _TILE] = METRICS[name].value(contacts_of(some), setting)
+            report(min(start + _TILE, len(values)))
         return values
     setting = Setting(disturbances=disturbances, cone_edges=cone_edges, task={})
     contacts = jax.tree.map(np.asarray, contacts_of(columns))

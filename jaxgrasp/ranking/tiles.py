@@ -62,6 +62,18 @@ def contacts_of(columns: Columns) -> Contacts:
     )
 
 
+def load_of(columns: Any, gravity: Any) -> Any:
+    """The wrench that candidates have to supply: under gravity along the object's -z, m/s^2, or that of their columns.
+
+    Args:
+        columns: What `columns_of` gathers, and maybe required_wrench.
+        gravity: None or 0.0 for none.
+    """
+    if gravity is None or (isinstance(gravity, float) and gravity == 0.0):
+        return columns.get("required_wrench")
+    return required_wrench(columns["mass"], gravity=jnp.array([0.0, 0.0, -1.0]) * gravity)
+
+
 def solve_in_tiles(
     solver: Callable[..., Any],
     columns: Columns,
@@ -131,9 +143,7 @@ def _solve_tile(
 ) -> Any:
     def on_one_device(columns: Any, disturbances: DisturbanceSet, gravity: Any) -> Any:
         contacts = contacts_of(columns)
-        load = columns.get("required_wrench")
-        if loaded:
-            load = required_wrench(columns["mass"], gravity=jnp.array([0.0, 0.0, -1.0]) * gravity)
+        load = load_of(columns, gravity if loaded else None)
         actuation = None
         if "jacobian" in columns:
             actuation = Actuation(**{f.name: columns.get(f.name) for f in dataclasses.fields(Actuation)})

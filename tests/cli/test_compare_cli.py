@@ -176,3 +176,13 @@ def test_bad_options(here, capsys, options, words):
 
 def test_compare_without_files(here, capsys):
     assert "at least one file" in refused(capsys, "compare")
+
+
+@pytest.mark.parametrize("kind", ["ball", "box"])
+def test_compare_takes_the_sets_that_rank_takes(here, capsys, kind):
+    names = "margin,margin_13"
+    options = ["--disturbances", kind, "--cone-edges", "4", "--gravity", "9.81", "--figure", "None"]
+    assert main(["compare", "grasps.npz", "--metric", names, *options]) == 0
+    with (here / "comparison.csv").open() as stream:
+        margin, free = csv.DictReader(stream)
+    assert float(free["answered"]) > 8 and float(margin["margin_13"]) > 0.8

@@ -392,13 +392,11 @@ def test_gradient_of_the_total_effort() -> None:
 
 def test_wrong_arguments_are_named() -> None:
     contacts = contacts_of(small())
-    forces, ball = jg.DisturbanceSet.forces(1.0), jg.DisturbanceSet.ball(1.0)
+    forces = jg.DisturbanceSet.forces(1.0)
     with pytest.raises(ValueError, match="formulation: got '14'"):
         jg.formulation_margin(contacts, forces, "14")
     with pytest.raises(ValueError, match="force_bound"):
         jg.formulation_margin(contacts, forces, "13", force_bound="norm")
-    with pytest.raises(ValueError, match="not given by vertices"):
-        jg.compare_formulations(contacts, ball)
     with pytest.raises(ValueError, match="not given by vertices"):
         jg.least_total_effort(contacts, forces + forces)
     with pytest.raises(ValueError, match="equation"):

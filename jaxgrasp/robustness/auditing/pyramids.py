@@ -218,6 +218,10 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
         [fold(jnp.add, jnp.moveaxis(pushes, 1, 0)) - wanted[:, :3], (moments - wanted[:, 3:]) / size], -1
     )
     largest = jnp.maximum(_max(jnp.abs(wanted[:, :3])), _max(jnp.abs(wanted[:, 3:] / size)))
+    if wrench is not None:
+        # What a disturbance leaves of the load is rounded as the load itself is.
+        load = problem.wrench
+        largest = jnp.maximum(largest, jnp.maximum(_max(jnp.abs(load[:, :3])), _max(jnp.abs(load[:, 3:] / size))))
     # Forces that are nothing but rounding are none.
     largest = jnp.maximum(largest, _sum(jnp.sqrt(_sum(f * f))))
     largest = jnp.maximum(largest, _NOTHING[f.dtype.name] * _max(jnp.where(problem.present, problem.max_force, 0)))

@@ -1,5 +1,7 @@
 """All formulations of the paper side by side, and forces for disturbances that are given outright, (6) and (9)-(10)."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -12,7 +14,14 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import contact_facets, pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.records import record
-from jaxgrasp.robustness.chain.formulations import Chain, check_vertices, choose_tile, formulation_margin
+from jaxgrasp.robustness.chain.formulations import (
+    Chain,
+    check_tolerance,
+    check_vertices,
+    choose_tile,
+    formulation_margin,
+)
+from jaxgrasp.robustness.chain.members import polytope_of
 from jaxgrasp.robustness.chain.programs import FORMULATIONS
 from jaxgrasp.robustness.chain.verdicts import FormulationSolution
 from jaxgrasp.robustness.grasps import over_grasps
@@ -38,7 +47,8 @@ class Binding:
     """The constraint that decides a margin: it has the largest multiplier, forces in units of their bounds."""
 
     direction: Int[Array, "*batch"]
-    """The disturbance, -1 where the forces at rest decide or there is no answer."""
+    """The disturbance, -1 where the forces at rest decide or there is no answer; 0 for the worst member of a set whose
+    directions are refined."""
     contact: Int[Array, "*batch"]
     """-1 where there is no answer."""
     row: Int[Array, "*batch"]
@@ -74,6 +84,7 @@ def compare_formulations(
     compliance: ArrayLike | Compliance | None = None,
     cone_edges: int = 8,
     force_bound: str = "normal",
+    tolerance: float | None = None,
 ) -> Comparison:
     """The margins of a batch of grasps by every formulation of the paper's chain.
 
@@ -82,11 +93,12 @@ def compare_formulations(
 
     Args:
         contacts: the grasps; their dtype is the precision.
-        disturbances: W_j, a single `DisturbanceSet.vertices` or `.forces`.
+        disturbances: the set D, as in `formulation_margin`.
         required_wrench: b (*batch, 6), N and N m; None is zero.
         compliance: Q of (14), as in `largest_disturbance`; only blocking forces depend on it.
         cone_edges: n_e of the inscribed pyramids.
         force_bound: "normal" or "norm", of "12" and "12_fixed".
+        tolerance: as in `formulation_margin`; where directions are refined, margins are lower bounds.
 
     Returns:
         Comparison with `*batch` axes.
@@ -99,11 +111,21 @@ def compare_formulations(
     """
     if force_bound not in ("normal", "norm"):
         raise ValueError(f"force_bound: got {force_bound!r}, wanted 'normal' or 'norm'")
-    check_vertices(disturbances)
     pyramid_facets(cone_edges)
-    kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", choose_tile(contacts, disturbances))
-    found = over_grasps(kernel, GraspData.from_arguments(contacts, disturbances, required_wrench, compliance))
-    unreduced: dict[str, FormulationSolution] = {name: solution for name, (solution, _) in found.items()}
+    check_tolerance(tolerance)
+    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    polytope = polytope_of(disturbances)
+    if polytope is not None:
+        kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", choose_tile(contacts, polytope))
+        found = over_grasps(kernel, replace(data, disturbances=polytope))
+        unreduced: dict[str, FormulationSolution] = {name: solution for name, (solution, _) in found.items()}
+    else:
+        bounds = {name: force_bound if form.exact else "normal" for name, form in FORMULATIONS.items()}
+        given = required_wrench, compliance, cone_edges
+        unreduced = {
+            name: formulation_margin(contacts, disturbances, name, *given, bound, tolerance)
+            for name, bound in bounds.items()
+        }
     reduced = largest_disturbance(contacts, disturbances, required_wrench, compliance, cone_edges)
     solutions: dict[str, FormulationSolution | Solution] = {**unreduced, "21": reduced}
     bindings = {name: Binding(direction=s.direction, contact=s.contact, row=s.row) for name, s in unreduced.items()}
@@ -210,6 +232,7 @@ def specified_disturbances(
     exact = equation == "6"
     bound = force_bound or ("norm" if exact else "normal")
     formulation = "12" if exact else "13"
+    check_vertices(disturbances)
     found = formulation_margin(contacts, disturbances, formulation, required_wrench, None, cone_edges, bound)
     margin = found.margin
     tolerance = 1e-7 if margin.dtype == jnp.float64 else 1e-4

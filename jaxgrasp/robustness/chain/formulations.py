@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgrasp.arrays import fold
@@ -35,6 +36,9 @@ from jaxgrasp.robustness.auditing.chain import (
 )
 from jaxgrasp.robustness.auditing.problem import Problem, problem_of
 from jaxgrasp.robustness.auditing.pyramids import balanced
+from jaxgrasp.robustness.blocking import weighted_pseudo_inverse
+from jaxgrasp.robustness.chain.cuts import refine_shared
+from jaxgrasp.robustness.chain.members import check_known, polytope_of, worst_of_rows
 from jaxgrasp.robustness.chain.programs import (
     FORMULATIONS,
     Basics,
@@ -44,6 +48,7 @@ from jaxgrasp.robustness.chain.programs import (
     contact_rows,
     scale_formulation,
 )
+from jaxgrasp.robustness.chain.refinement import refine
 from jaxgrasp.robustness.chain.verdicts import (
     ACCEPTED,
     FormulationSolution,
@@ -53,13 +58,15 @@ from jaxgrasp.robustness.chain.verdicts import (
     with_moments,
 )
 from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
-from jaxgrasp.robustness.interface.arguments import Arguments, GraspData
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, lay_out
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.conic.margin import ConicPoint
 from jaxgrasp.solvers.status import Status
 
 # Contacts under all directions in a tile.
 _TILE = 1024
+# How far bounds may be apart where directions are refined, as a share.
+TOLERANCE = {"float64": 1e-4, "float32": 1e-2}
 
 
 def formulation_margin(
@@ -70,6 +77,7 @@ def formulation_margin(
     compliance: ArrayLike | Compliance | None = None,
     cone_edges: int = 8,
     force_bound: str = "normal",
+    tolerance: float | None = None,
 ) -> FormulationSolution:
     """The largest disturbance by one formulation of the paper's chain.
 
@@ -88,25 +96,36 @@ def formulation_margin(
     which the blocking forces add. (16) and (19), the rows of (21), are equivalent for lambda >= 0: a row holds for all
     directions if it holds for the worst.
 
+    Sets may be given by vertices, W_j, or be boxes, balls, ellipsoids and sums. Of a box its 64 corners count, in the
+    order of itertools.product((-1, 1), repeat=6). For other sets (16) takes the members that load its rows most, which
+    is exact: n_c (n_e + 1), and 12 that reach outside the range of G. The other formulations refine directions until
+    two bounds meet: margin is then what is proven for the whole set, upper_bound what one of its members allows, and
+    the solution is that of this member, `worst_wrench`, as the only direction. That looks at numbers, so it cannot be
+    part of jit, vmap or grad.
+
     Args:
         contacts: the grasps; their dtype is the precision.
-        disturbances: W_j, a single `DisturbanceSet.vertices` or `.forces`.
+        disturbances: the set D, see above.
         formulation: one of the names above.
         required_wrench: b (*batch, 6), N and N m; None is zero.
         compliance: Q of (14), as in `largest_disturbance`; only blocking forces depend on it.
         cone_edges: n_e of the inscribed pyramids.
         force_bound: "normal" bounds |f_n| as (8) and the linear programs do, "norm" bounds |f| as (6) and (12) do. A
-            norm is no linear row: only exact cones take it.
+            norm is no linear row: only exact cones take it, "12_fixed" for boxes and vertices alone.
+        tolerance: where directions are refined, how far margin may be below upper_bound, as a share of it; None is 1e-4
+            (float32: 1e-2).
 
     Returns:
         FormulationSolution with `*batch` axes.
 
     Raises:
-        ValueError: shapes or options that do not fit; at trace time.
+        ValueError: shapes or options that do not fit; at trace time. Sets whose directions are refined inside a
+            transformation.
 
     Status:
         SOLVED; INFEASIBLE (no admissible f_0, for "per_direction" no f at all; margin NaN); UNBOUNDED (nothing
-        disturbs); MAX_ITERATIONS; INVALID_INPUT. As in `largest_disturbance`, a required wrench outside the range of G
+        disturbs); MAX_ITERATIONS, where directions are refined with bounds that hold but are farther apart than the
+        tolerance; INVALID_INPUT. As in `largest_disturbance`, a required wrench outside the range of G
         is INFEASIBLE and a disturbance outside it makes the margin 0, also where one would cancel the other.
 
     Derivatives:
@@ -119,11 +138,48 @@ def formulation_margin(
         raise ValueError(f"force_bound: got {force_bound!r}, wanted 'normal' or 'norm'")
     if force_bound == "norm" and not FORMULATIONS[formulation].exact:
         raise ValueError(f"force_bound: got 'norm' for {formulation!r}, wanted 'normal', since pyramids are linear")
-    check_vertices(disturbances)
     pyramid_facets(cone_edges)
-    kernel = Chain((formulation,), cone_edges, force_bound == "norm", choose_tile(contacts, disturbances))
-    solved = over_grasps(kernel, GraspData.from_arguments(contacts, disturbances, required_wrench, compliance))
-    return with_moments(solved[formulation][0], contacts)
+    given = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    check_tolerance(tolerance)
+
+    def solve(data: GraspData) -> FormulationSolution:
+        tile = choose_tile(data.contacts, data.disturbances)
+        kernel = Chain((formulation,), cone_edges, force_bound == "norm", tile)
+        return over_grasps(kernel, data)[formulation][0]
+
+    polytope, inverse = polytope_of(disturbances), None
+    shares_f0 = not FORMULATIONS[formulation].free and FORMULATIONS[formulation].one_f0
+    if polytope is None and shares_f0:
+        if contacts.torsional_friction is not None:
+            raise ValueError(
+                f"disturbances: got a set without vertices for {formulation!r} and soft contacts, wanted vertices or a "
+                "box, or contacts without torsional_friction"
+            )
+        if force_bound == "norm":
+            raise ValueError("force_bound: got 'norm' for '12_fixed' and a set without vertices, wanted 'normal'")
+        inverse = weighted_pseudo_inverse(contacts, compliance)
+        polytope = worst_of_rows(contacts, disturbances, inverse, cone_edges)
+    if not is_refined(disturbances, formulation) or 0 in contacts.batch_shape:
+        vertices = polytope or DisturbanceSet.vertices(jnp.zeros((1, 6)))
+        return with_moments(solve(replace(given, disturbances=vertices)), contacts)
+    check_known(given)
+    tolerance = TOLERANCE[contacts.positions.dtype.name] if tolerance is None else tolerance
+    arguments = lay_out(given, Options())
+    if polytope is None or inverse is None:
+        return with_moments(refine(arguments, solve, tolerance), contacts)
+    flat = lambda x: np.asarray(jnp.broadcast_to(x, (*arguments.batch, *x.shape[-2:])).reshape(-1, *x.shape[-2:]))
+    return refine_shared(arguments, solve, flat(wrenches_of(polytope.terms)), flat(inverse), tolerance)
+
+
+def is_refined(disturbances: DisturbanceSet, formulation: str) -> bool:
+    """Whether directions of a set have to be refined for a formulation, which no program under jit can do."""
+    return formulation != "16" and polytope_of(disturbances) is None
+
+
+def check_tolerance(tolerance: float | None) -> None:
+    """Refuse a tolerance that is no share."""
+    if tolerance is not None and not 0 < tolerance < 1:
+        raise ValueError(f"tolerance: got {tolerance}, wanted a number in (0, 1), or None")
 
 
 def check_vertices(disturbances: DisturbanceSet) -> None:

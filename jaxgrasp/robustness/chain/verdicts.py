@@ -58,7 +58,9 @@ class FormulationSolution:
     primal_residual: Float[Array, "*batch"]
     """Largest violation of any row or equality, forces in units of f_max (mu f_max along the surface)."""
     gap: Float[Array, "*batch"]
-    """(upper_bound - margin) / max(scale, margin)."""
+    """(upper_bound - margin) / max(scale, margin), over upper_bound where directions are refined."""
+    worst_wrench: Float[Array, "*batch 6"] | None = None
+    """The member of the set that decides, N and N m, where directions are refined; else None."""
     moments: Float[Array, "*batch contacts"] | None = None
     """The moments about the normals that come with `forces`, N m; None for hard contacts."""
     disturbed_moments: Float[Array, "*batch directions contacts"] | None = None
@@ -82,7 +84,8 @@ def _split(solution: FormulationSolution, contacts: Contacts) -> FormulationSolu
 
 def select_programs(grasps: Grasps, basics: Basics, scaled: Scaled, free: bool) -> tuple[ConicMargin, jax.Array]:
     """The programs of a formulation, and which of them to solve: all but those whose optimum is known."""
-    runs = jnp.broadcast_to(grasps.valid & ~basics.load_outside, scaled.scale.shape)
+    runs = grasps.valid & ~basics.load_outside & (grasps.present > 0).any(0)
+    runs = jnp.broadcast_to(runs, scaled.scale.shape)
     if free:
         unknown = basics.disturbed & ~basics.outside
         runs &= jnp.concatenate([unknown, jnp.ones_like(unknown[:1])])
@@ -114,10 +117,13 @@ def decide(grasps: Grasps, basics: Basics, scale: jax.Array, form: Formulation, 
     """Decide from the outcome of its programs what the margin of a formulation is."""
     accepted = ACCEPTED[scale.dtype.name]
     value, bound = jnp.minimum(out.point.margin, out.upper), out.upper
-    solved = (out.error <= accepted) & ~out.infeasible
+    # Without contacts there is no program; no forces at all bear a load of zero, and no disturbance.
+    empty = (grasps.present == 0).all(0)
+    solved = ((out.error <= accepted) & ~out.infeasible) | empty
     # What is zero to the tolerance is zero; without a load exactly, by no forces at all.
     zero = jnp.where(_unloaded(grasps), 0, jnp.maximum(value, 0))
-    value = jnp.where(solved & (jnp.abs(value) <= accepted), zero, value)
+    value = jnp.where(empty, 0, jnp.where(solved & (jnp.abs(value) <= accepted), zero, value))
+    bound = jnp.where(empty, 0, bound)
     hopeless = out.infeasible | (solved & (value < 0)) | (bound < -accepted)
     infeasible, unknown = _feasibility(basics, form, solved | hopeless, hopeless)
 
@@ -180,13 +186,15 @@ def _balance(grasps: Grasps, basics: Basics, rest: jax.Array, forces: jax.Array,
     Directions without a lambda_j above 0 do not count.
     """
     counts = jnp.isfinite(reached) & (reached > 0)
-    required = grasps.wrench - jnp.moveaxis(jnp.where(counts, reached, 0) * basics.wrenches, 1, 0)
-    required = jnp.concatenate([required, grasps.wrench[None]])
+    taken = jnp.moveaxis(jnp.where(counts, reached, 0) * basics.wrenches, 1, 0)
+    required = jnp.concatenate([grasps.wrench - taken, grasps.wrench[None]])
     counts = jnp.concatenate([counts, jnp.ones_like(counts[:1])])
     supplying = jnp.concatenate([forces, rest[None]])
     supplied = jnp.einsum("eanl,danl->del", grasps.columns, supplying, precision="highest")
     sizes = jnp.sqrt((supplying * supplying).sum(1)).sum(1)
-    sizes = jnp.maximum(sizes, jnp.abs(required).max(1))
+    # A disturbance that takes all of the load off leaves nothing but the rounding of their difference.
+    taken = jnp.concatenate([jnp.abs(taken).max(1), jnp.abs(grasps.wrench).max(0)[None]])
+    sizes = jnp.maximum(jnp.maximum(sizes, jnp.abs(required).max(1)), taken)
     right = jnp.abs(supplied - required).max(1) <= _MISSED[forces.dtype.name] * sizes
     return (right | ~counts).all(0)
 
