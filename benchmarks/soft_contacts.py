@@ -155,24 +155,23 @@ def published(hand: str, folders: list[Path]) -> list[str]:
     found = [published_grasps.candidates(hand, folder) for folder in folders]
     soft = concatenate([candidates for candidates, _ in found])
     held = np.concatenate([table["succ_flag"].astype(bool) for _, table in found])
-    margins = {
-        f"{name}{', with actuators' if limited else ''}": published_grasps.margins(candidates, limited)
-        for limited in (False, True)
-        for name, candidates in (("soft", soft), ("hard", hardened(soft)))
-    }
-    prediction = compare_metrics(margins, held).prediction
-    assert prediction is not None
-    rows = zip(margins, prediction.auc, prediction.interval, prediction.lead, strict=True)
-    return [
+    lines = [
         f"{len(held)} grasps of {', '.join(folder.name for folder in folders)}, friction 0.6 and {GAMMA} m.",
         "",
         "| margin | AUC | 95 % | soft leads by | 95 % |",
         "|---|---|---|---|---|",
-        *[
-            f"| {n} | {a:.3f} | {i[0]:.3f} to {i[1]:.3f} | {d[0]:+.4f} | {d[1]:+.4f} to {d[2]:+.4f} |"
-            for n, a, i, d in rows
-        ],
     ]
+    for limited in (False, True):
+        each = {"soft": soft, "hard": hardened(soft)}
+        margins = {name: published_grasps.margins(candidates, limited) for name, candidates in each.items()}
+        prediction = compare_metrics(margins, held).prediction
+        assert prediction is not None
+        rows = zip(margins, prediction.auc, prediction.interval, prediction.lead, strict=True)
+        for name, area, (low, high), lead in rows:
+            name = f"{name}{', with actuators' if limited else ''}"
+            led = f"{lead[0]:+.3f} | {lead[1]:+.3f} to {lead[2]:+.3f}" if name.startswith("hard") else "|"
+            lines.append(f"| {name} | {area:.3f} | {low:.3f} to {high:.3f} | {led} |")
+    return lines
 
 
 def report(hand: str | None, folders: list[Path]) -> str:

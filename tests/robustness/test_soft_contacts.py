@@ -370,3 +370,19 @@ def test_batches_of_any_shape_and_shared_contacts():
     stacked = jax.tree.map(lambda x: jnp.stack([x] * 5), contacts)
     mapped = jax.vmap(lambda c: jg.largest_disturbance(c, wrenches).moments)(stacked)
     assert mapped.shape == (5, 2)
+
+
+def test_sets_without_vertices_are_refused_where_all_members_share_f0():
+    ball = jg.DisturbanceSet.ball(1.0, 0.01)
+    with pytest.raises(ValueError, match="a set without vertices for '16' and soft contacts, wanted vertices or a box"):
+        jg.formulation_margin(opposed(0.02), ball, "16")
+
+
+@pytest.mark.thorough
+def test_free_answers_to_a_ball():
+    contacts = opposed(0.02)
+    # The ball's moments about the line, and its forces, are what two opposed fingers bear least.
+    found = jg.formulation_margin(contacts, jg.DisturbanceSet.ball(1.0, 0.05), "13")
+    assert found.status == jg.Status.SOLVED and found.moments.shape == (2,)
+    ends = np.concatenate([np.eye(6), -np.eye(6)]) * np.repeat([1, 0.05], 3)
+    assert found.margin <= jg.formulation_margin(contacts, jg.DisturbanceSet.vertices(ends), "13").margin * (1 + 1e-6)
