@@ -56,8 +56,14 @@ SETS: dict[str, Callable[[jnp.dtype], jg.DisturbanceSet]] = {
 }
 
 
-def margin(dtype, n_c=3, cone_edges=4, families=FAMILIES, disturbances=None, moved=lambda c: c, **options):
+def by_row(reserve: jax.Array, n_c: int, cone_edges: int) -> jax.Array:
+    """A share of a grasp's cone margin in every row, nothing in the first."""
+    return reserve[:, None, None] * jnp.linspace(0, 1, n_c * cone_edges, dtype=reserve.dtype).reshape(n_c, cone_edges)
+
+
+def margin(dtype, n_c=3, cone_edges=4, families=FAMILIES, disturbances=None, moved=lambda c: c, rows=False, **options):
     contacts, vertices, load, reserve = harness.data_of(batch(n_c, families), dtype)
+    reserve = by_row(reserve, n_c, cone_edges) if rows else reserve
     wrenches = SETS[disturbances](dtype) if disturbances else vertices
     given = {name: value(dtype) for name, value in options.items()}
     return jg.largest_disturbance(moved(contacts), wrenches, load, cone_edges=cone_edges, cone_margin=reserve, **given)
@@ -145,6 +151,7 @@ GROUPS: dict[str, dict[str, Program]] = {
         "smoothed margin": partial(margin, **SMOOTHING),
         "smoothed effort": partial(effort, **SMOOTHING),
         "cutoff": partial(margin, cutoff=number(2.0)),
+        "cone margins of rows": partial(margin, rows=True),
         "compliance": partial(margin, compliance=blocks(LANES, 3, 3, 3)),
         "effort, compliance": partial(effort, compliance=blocks(LANES, 3, 3, 3)),
         "compliance of all": partial(margin, compliance=blocks(9, 9)),

@@ -45,7 +45,8 @@ class Grasp:
     compliance: np.ndarray | None = None
     """None for the identity, (n_c, 3, 3) blocks, (3 n_c, 3 n_c), or (n_d, 3 n_c, 3 n_c) with one for each vertex."""
     cone_edges: int = 8
-    cone_margin: float = 0.0
+    cone_margin: float | np.ndarray = 0.0
+    """d, newtons: for all rows, (n_c, 1), or (n_c, n_e)."""
     torsional: np.ndarray | None = None
     """(n_c,), metres; None for hard contacts. Moments m about the normals are a fourth component, m mu / gamma, N,
     which compliances and weights weigh."""
@@ -76,6 +77,12 @@ class Grasp:
         """C of (1): (n_c n_e, 3 n_c), block diagonal."""
         rows = facet_rows if self.torsional is None else soft_facet_rows
         return scipy.linalg.block_diag(*(rows(mu, self.cone_edges) for mu in self.friction))
+
+    @cached_property
+    def row_margins(self) -> np.ndarray:
+        """d of (1): (n_c n_e,)."""
+        rows = self.cone_edges * (self.components - 2)
+        return np.broadcast_to(self.cone_margin, (len(self.positions), rows)).reshape(-1)
 
     @cached_property
     def normal_matrix(self) -> np.ndarray:
@@ -198,7 +205,7 @@ def program(grasp: Grasp, every_direction: bool = False) -> Program:
     slippery = grasp.normal_matrix[mu == 0]
     rows = np.vstack([grasp.cone_matrix, -grasp.normal_matrix, slippery])
     unit = np.concatenate([cone_unit, F, F[mu == 0]])
-    limit = np.concatenate([np.full(len(cone_unit), -grasp.cone_margin), F, np.zeros(len(slippery))])
+    limit = np.concatenate([-grasp.row_margins, F, np.zeros(len(slippery))])
     change = -grasp.force_changes @ rows.T
     sigma = change.reshape(-1) if every_direction else change.max(axis=0)
     cases = len(change) if every_direction else 1
@@ -305,7 +312,7 @@ def row_violation(grasp: Grasp, forces: np.ndarray, margin: float) -> float:
     """How far (n_c, 3) forces, (n_c, 4) with moments in newtons, overstep (21)'s rows at the margin, by f_max."""
     S_1, S_2 = worst_case(grasp)
     f, F = forces.reshape(-1), grasp.max_force
-    cone = (grasp.cone_matrix @ f - S_1 * margin + grasp.cone_margin) / np.repeat(F, len(S_1) // len(F))
+    cone = (grasp.cone_matrix @ f - S_1 * margin + grasp.row_margins) / np.repeat(F, len(S_1) // len(F))
     bound = (-(grasp.normal_matrix @ f) + S_2 * margin - F) / F
     balance = (grasp.grasp_map @ f - grasp.required_wrench) * grasp.row_scale / F.max()
     return float(max(cone.max(), bound.max(), np.abs(balance).max()))

@@ -22,7 +22,7 @@ RANK_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Case:
-    """One grasp: (n_c, 3), (n_c, 3, 3), (n_c,), (n_c,), wrenches (n_d, 6), load (6,)."""
+    """One grasp: (n_c, 3), (n_c, 3, 3), (n_c,), (n_c,), wrenches (n_d, 6), load (6,), cone margins (n_c, 1 or n_e)."""
 
     positions: np.ndarray
     frames: np.ndarray
@@ -31,6 +31,7 @@ class Case:
     wrenches: np.ndarray
     load: np.ndarray
     edges: int = 8
+    cone_margins: np.ndarray | float = 0.0
     torsional: np.ndarray | None = None
     """(n_c,), m: soft contacts, with moments m as the fourth component m mu / gamma; None for hard ones."""
 
@@ -109,15 +110,18 @@ class Case:
                 pole = np.full((self.edges, 1), np.cos(np.pi / self.edges))
                 facets = np.vstack([np.hstack([facets, pole]), np.hstack([facets, -pole])])
             blocks.append(np.vstack([facets, -np.eye(self.size)[2:3]]))
-        sides = np.append(np.zeros(len(blocks[0]) - 1), 1.0)
-        return sp.block_diag(blocks).toarray(), np.tile(sides, len(self.friction))
+        shares = self.cone_margins / self.max_force[:, None]
+        sides = np.hstack([-shares + np.zeros((len(blocks), len(blocks[0]) - 1)), np.ones((len(blocks), 1))])
+        return sp.block_diag(blocks).toarray(), sides.reshape(-1)
 
     def cones(self, norm_bound: bool) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """(kind, A, h) with h - A f in the cone: kind "q" second-order, "l" non-negative; a contact after the other."""
         n, parts = len(self.friction), []
+        shares = np.broadcast_to(self.cone_margins / self.max_force[:, None], (n, 1))[:, 0]
         for i, mu in enumerate(self.friction):
             e = np.eye(self.size * n)[self.size * i : self.size * (i + 1)]
-            parts.append(("q", np.vstack([mu * e[2], -np.delete(e, 2, 0)]), np.zeros(self.size)))
+            sides = -shares[i] * np.eye(self.size)[0]
+            parts.append(("q", np.vstack([mu * e[2], -np.delete(e, 2, 0)]), sides))
             if norm_bound:
                 parts.append(("q", np.vstack([0 * e[:1], -e[:3]]), np.array([1.0, 0, 0, 0])))
             else:
@@ -295,13 +299,13 @@ class Batch:
         given = {f.name: getattr(self, f.name) for f in fields(self)}
         return Batch(**{name: None if value is None else value[rows] for name, value in given.items()})
 
-    def case(self, i: int, edges: int = 8) -> Case:
+    def case(self, i: int, edges: int = 8, cone_margins: np.ndarray | float = 0.0) -> Case:
         """One of them."""
         wrenches = self.wrenches[i]
         wrenches = wrenches[np.any(wrenches != 0, -1)]
         torsional = None if self.torsional is None else self.torsional[i]
         given = self.positions[i], self.frames[i], self.friction[i], self.max_force[i]
-        return Case(*given, wrenches, self.load[i], edges, torsional)
+        return Case(*given, wrenches, self.load[i], edges, cone_margins, torsional)
 
 
 def _units(rng: np.random.Generator, *shape: int) -> np.ndarray:

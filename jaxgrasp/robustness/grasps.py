@@ -54,8 +54,9 @@ class Grasps:
     """bool (*lanes), all contacts are on one line, exactly: two of them always are. G has rank 5 at most."""
     wrench: jax.Array
     """(6, *lanes), b, N."""
-    reserve: jax.Array
-    """(*lanes), d, N."""
+    reserve: jax.Array | None
+    """d, N: (*lanes), one value a grasp, (n, *lanes), a contact, or (n_e, n, *lanes), a row; zero where absent. None
+    where there is none."""
     terms: tuple[Term, ...]
     """The disturbance set, moments in N m; leaves may have lanes of size 1."""
     extents: tuple[jax.Array, ...]
@@ -75,6 +76,22 @@ class Grasps:
     def rows(self) -> jax.Array:
         """(6 + r, k, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
         return stack_rows(self.columns, self.actuated)
+
+    @property
+    def reserves_nothing(self) -> jax.Array:
+        """Whether d = 0 in every row, (*lanes)."""
+        if self.reserve is None:
+            return jnp.ones_like(self.valid)
+        zero = self.reserve == 0
+        for _ in range(zero.ndim - self.length.ndim):
+            zero = fold(jnp.logical_and, zero)
+        return zero
+
+    def row_reserves(self, unit: jax.Array, cone_edges: int) -> jax.Array:
+        """Give every row its d in units (n, *lanes), N, of its contact: (n_e, n, *lanes), zero where absent."""
+        assert self.reserve is not None
+        reserve = jnp.where(self.present > 0, self.reserve / unit, 0)
+        return jnp.broadcast_to(reserve, (cone_edges, *self.present.shape))
 
 
 def over_grasps(function: BatchedFunction, data: GraspData, options: Options | None = None) -> Any:
@@ -133,7 +150,9 @@ def admit(inputs: Inputs) -> Grasps:
     valid &= usable
     weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, active, valid)
     valid &= usable
-    valid &= jnp.isfinite(load).all(0) & (data.cone_margin >= 0) & jnp.isfinite(data.cone_margin)
+    valid &= jnp.isfinite(load).all(0)
+    if data.cone_margin is not None:
+        valid &= _usable_reserve(data.cone_margin, active)
     for extent in inputs.extents:
         valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)
     if data.actuation is not None:
@@ -169,7 +188,7 @@ def admit(inputs: Inputs) -> Grasps:
         columns=grasp_columns(positions / length, frames, arms),
         lined=lined,
         wrench=wrench * units,
-        reserve=jnp.where(valid, data.cone_margin, 0),
+        reserve=None if data.cone_margin is None else _admit_reserve(data.cone_margin, present, valid),
         terms=data.disturbances.terms,
         extents=inputs.extents,
         inverse_root=root,
@@ -188,6 +207,22 @@ def _usable_contacts(contacts: Contacts) -> jax.Array:
     if contacts.torsional_friction is not None:
         usable &= (contacts.torsional_friction >= 0) & jnp.isfinite(contacts.torsional_friction)
     return (usable | ~contacts.active).all(0)
+
+
+def _usable_reserve(reserve: jax.Array, active: jax.Array) -> jax.Array:
+    """Whether d is finite and not negative, where contacts are there, (*lanes)."""
+    usable = (reserve >= 0) & jnp.isfinite(reserve)
+    if usable.ndim < active.ndim:
+        return usable
+    usable = fold(jnp.logical_and, jnp.moveaxis(usable, 1, 0)) if usable.ndim > active.ndim else usable
+    return (usable | ~active).all(0)
+
+
+def _admit_reserve(reserve: jax.Array, present: jax.Array, valid: jax.Array) -> jax.Array:
+    """Lay out d as in `Grasps`, from (*lanes), (n, *lanes) or (n, n_e, *lanes)."""
+    if reserve.ndim < present.ndim:
+        return jnp.where(valid, reserve, 0)
+    return jnp.where(present, jnp.moveaxis(reserve, 1, 0) if reserve.ndim > present.ndim else reserve, 0)
 
 
 def _roots_of_compliance(

@@ -21,6 +21,7 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.robustness import Solution, largest_disturbance
+from jaxgrasp.robustness.interface.cone_margins import cone_margin_shape
 
 # Of u a step, at first; it falls to a tenth along a cosine.
 _LEARNING_RATE = 0.3
@@ -68,7 +69,7 @@ def optimize_compliance(
         disturbances: the set D; without batch axes it is shared by all grasps.
         required_wrench: b (*batch, 6), N and N m; None is zero.
         cone_edges: n_e.
-        cone_margin: d (*batch,), N, >= 0.
+        cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`.
         steps: of the ascent; each costs a margin and its gradient. Other numbers of steps compile anew.
         spread: largest ratio of two entries of Q in a grasp, > 1. Q gets lost in rounding where it is too large.
 
@@ -89,12 +90,13 @@ def optimize_compliance(
     n = contacts.n_c
     wrench = as_float("required_wrench", jnp.zeros(6) if required_wrench is None else required_wrench, (6,))
     reserve = as_float("cone_margin", cone_margin, ())
-    batch = broadcast_batch(
-        contacts=contacts.batch_shape,
-        disturbances=disturbances.batch_shape,
-        required_wrench=wrench.shape[:-1],
-        cone_margin=reserve.shape,
-    )
+    batches = {
+        "contacts": contacts.batch_shape,
+        "disturbances": disturbances.batch_shape,
+        "required_wrench": wrench.shape[:-1],
+    }
+    event = cone_margin_shape(reserve.shape, max(map(len, batches.values())), n, cone_edges)
+    batch = broadcast_batch(**batches, cone_margin=reserve.shape[: reserve.ndim - len(event)])
     solve = functools.partial(largest_disturbance, contacts, disturbances, wrench, cone_edges=cone_edges)
     solve = functools.partial(solve, cone_margin=reserve)
     bound = jnp.asarray(0.5 * math.log(spread), contacts.positions.dtype)

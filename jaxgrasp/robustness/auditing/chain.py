@@ -39,11 +39,14 @@ def admissible(problem: Problem, forces: jax.Array, exact: bool, cone_edges: int
         square = forces[..., 0] ** 2 + forces[..., 1] ** 2
         tangent = jnp.sqrt(square if problem.arms is None else square + forces[..., 3] ** 2)
         over = tangent + friction * normal
+        over = over if problem.reserve is None else over + problem.reserve[..., 0]
         within = (normal <= slack) & (over <= slack)
         if norm_bound:
             within &= jnp.sqrt((forces[..., :3] ** 2).sum(-1)) <= most + slack
     else:
-        within = (row_values(problem, forces, cone_edges)[0] <= slack[..., None]).all(-1)
+        cone = row_values(problem, forces, cone_edges)[0]
+        cone = cone if problem.reserve is None else cone + problem.reserve
+        within = (cone <= slack[..., None]).all(-1)
     return ((within & (-normal <= most + slack)) | ~problem.present).all(-1)
 
 

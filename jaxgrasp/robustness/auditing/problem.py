@@ -23,7 +23,7 @@ class Problem(NamedTuple):
     present: bool (lanes, n).
     size: (lanes,), m, root-mean-square distance of the contacts from the centre of mass; 1 where that is zero.
     wrench: (lanes, 6), b, N and N m.
-    reserve: (lanes,), d, N.
+    reserve: (lanes, n or 1, n_e or 1), d, N, zero where a contact is absent; None where there is none.
     terms: the disturbance set, lanes trailing.
     reach: (lanes, 6), the largest |w_i| of the set.
     compliance, per_vertex, weights, margin, cutoff: as given; None where not.
@@ -38,7 +38,7 @@ class Problem(NamedTuple):
     present: jax.Array
     size: jax.Array
     wrench: jax.Array
-    reserve: jax.Array
+    reserve: jax.Array | None
     terms: tuple[Term, ...]
     reach: jax.Array
     compliance: jax.Array | None
@@ -88,7 +88,7 @@ def problem_of(arguments: Arguments) -> Problem:
         present=present,
         size=largest * jnp.sqrt(jnp.where(square > 0, square, 1)),
         wrench=data.required_wrench,
-        reserve=data.cone_margin,
+        reserve=None if data.cone_margin is None else _reserve(data.cone_margin, present),
         terms=jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), data.disturbances.terms),
         reach=sum(inputs.extents),  # pyright: ignore[reportArgumentType]  # no sum of none
         compliance=None if isinstance(compliance, Compliance) else compliance,
@@ -100,6 +100,11 @@ def problem_of(arguments: Arguments) -> Problem:
         if data.actuation is None
         else _hand(data.actuation, here(data.actuation.jacobian, 0), friction, strongest),
     )
+
+
+def _reserve(reserve: jax.Array, present: jax.Array) -> jax.Array:
+    rows = reserve.reshape(*reserve.shape, *[1] * (3 - reserve.ndim))
+    return rows if reserve.ndim == 1 else jnp.where(present[:, :, None], rows, 0)
 
 
 def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_force: jax.Array) -> Hand:

@@ -170,7 +170,8 @@ def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array
     there = problem.present
     cone, bound = row_values(problem, forces, edges_of(problem, rows.cone))
     slack = missed * problem.max_force
-    spare = (slack - problem.reserve[:, None])[:, :, None] - cone
+    assert problem.reserve is not None
+    spare = (slack[:, :, None] - problem.reserve) - cone
     parts = [_most(jnp.where(there[:, :, None], spare, jnp.inf), rows.cone)]
     parts += [_most(jnp.where(there, problem.max_force + slack - bound, jnp.inf), rows.bound)]
     holds = balanced(problem, forces)
@@ -243,20 +244,25 @@ def _driven(hand: Hand, forces: jax.Array, efforts: jax.Array) -> jax.Array:
     return jnp.abs(given - taken).max(-1) <= MISSED[forces.dtype.name] * largest
 
 
-def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A'z + G'y, (lanes, n, k), and the sum of the cone rows' multipliers of every contact, (lanes, n)."""
+def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> jax.Array:
+    """A'z + G'y, (lanes, n, k)."""
     patterns = facets(problem, edges_of(problem, cone))
-    patterns = jnp.concatenate([patterns, jnp.ones_like(patterns[:, :1])], 1)
     pull = fold(jnp.add, [cone[..., k, None] * patterns[k] for k in range(cone.shape[-1])])
     turned = y[:, None, :3] + cross(jnp.broadcast_to(y[:, None, 3:], problem.positions.shape), problem.positions, -1)
     frames = problem.frames
     along = frames[:, :, 0] * turned[..., :1] + frames[:, :, 1] * turned[..., 1:2] + frames[:, :, 2] * turned[..., 2:]
     normal = pull[..., 2] * problem.friction - bound
     residual = jnp.stack([pull[..., 0], pull[..., 1], normal], -1) + along
-    if problem.arms is not None:
-        turn = problem.arms * (frames[..., 2] * y[:, None, 3:]).sum(-1)
-        residual = jnp.concatenate([residual, (pull[..., 3] + turn)[..., None]], -1)
-    return residual, pull[..., -1]
+    if problem.arms is None:
+        return residual
+    turn = problem.arms * (frames[..., 2] * y[:, None, 3:]).sum(-1)
+    return jnp.concatenate([residual, (pull[..., 3] + turn)[..., None]], -1)
+
+
+def _held(problem: Problem, cone: jax.Array, bound: jax.Array) -> jax.Array:
+    """Add up h'z of every contact, (lanes, n)."""
+    assert problem.reserve is not None
+    return bound * problem.max_force - _sum(cone * problem.reserve)
 
 
 def _lost(problem: Problem, residual: jax.Array) -> jax.Array:
@@ -272,7 +278,7 @@ def _lost(problem: Problem, residual: jax.Array) -> jax.Array:
 def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.Array, jax.Array]:
     """The bound that the multipliers prove, inf where none, and whether they prove that b cannot be borne; (lanes,)."""
     cone, bound, y = evidence.cone_multipliers, evidence.bound_multipliers, evidence.wrench_multipliers
-    residual, total = _pulled(problem, cone, bound, y)
+    residual = _pulled(problem, cone, bound, y)
     pull = _sum(cone * rows.cone, 2) + _sum(bound * rows.bound)
     sound = (_min(cone, 2) >= 0) & (_min(bound) >= 0)
     value, more = _sum(problem.wrench * y), 0.0
@@ -281,7 +287,7 @@ def _upper_bound(problem: Problem, evidence: Evidence, rows: Rows) -> tuple[jax.
         pull, value = pull + held[0], value + held[1] + spent
         assert evidence.actuator_multipliers is not None
         sound &= _min(evidence.actuator_multipliers, 2) >= 0
-    each = bound * problem.max_force - total * problem.reserve[:, None] + _lost(problem, residual + more)
+    each = _held(problem, cone, bound) + _lost(problem, residual + more)
     value = value + _sum(jnp.where(problem.present, each, 0))
     bound = jnp.where(sound & (pull > 0), value / jnp.where(pull > 0, pull, 1), jnp.inf)
     return bound, sound & (value < 0)
@@ -333,9 +339,8 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     dtype, there, forces, asked = solution.forces.dtype.name, problem.present, solution.forces, problem.margin
     cone, bound, y = solution.cone_multipliers, solution.bound_multipliers, solution.wrench_multipliers
     sound = (_min(cone, 2) >= 0) & (_min(bound) >= 0)
-    residual, total = _pulled(problem, cone, bound, y)
-    held = bound * problem.max_force - total * problem.reserve[:, None]
-    held = _sum(jnp.where(there, held, 0)) + _sum(problem.wrench * y)
+    residual = _pulled(problem, cone, bound, y)
+    held = _sum(jnp.where(there, _held(problem, cone, bound), 0)) + _sum(problem.wrench * y)
     assert asked is not None
     held -= asked * (_sum(cone * rows.cone, 2) + _sum(bound * rows.bound))
     if problem.hand is not None:

@@ -85,6 +85,7 @@ def compare_formulations(
     cone_edges: int = 8,
     force_bound: str = "normal",
     tolerance: float | None = None,
+    cone_margin: ArrayLike | None = None,
 ) -> Comparison:
     """The margins of a batch of grasps by every formulation of the paper's chain.
 
@@ -99,6 +100,8 @@ def compare_formulations(
         cone_edges: n_e of the inscribed pyramids.
         force_bound: "normal" or "norm", of "12" and "12_fixed".
         tolerance: as in `formulation_margin`; where directions are refined, margins are lower bounds.
+        cone_margin: d, N, >= 0: a grasp or a contact, as in `formulation_margin`. "12" and "12_fixed" have no rows for
+            one value a row.
 
     Returns:
         Comparison with `*batch` axes.
@@ -113,7 +116,7 @@ def compare_formulations(
         raise ValueError(f"force_bound: got {force_bound!r}, wanted 'normal' or 'norm'")
     pyramid_facets(cone_edges)
     check_tolerance(tolerance)
-    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin)
     polytope = polytope_of(disturbances)
     if polytope is not None:
         kernel = Chain(tuple(FORMULATIONS), cone_edges, force_bound == "norm", choose_tile(contacts, polytope))
@@ -123,10 +126,11 @@ def compare_formulations(
         bounds = {name: force_bound if form.exact else "normal" for name, form in FORMULATIONS.items()}
         given = required_wrench, compliance, cone_edges
         unreduced = {
-            name: formulation_margin(contacts, disturbances, name, *given, bound, tolerance)
+            name: formulation_margin(contacts, disturbances, name, *given, bound, tolerance, cone_margin)
             for name, bound in bounds.items()
         }
-    reduced = largest_disturbance(contacts, disturbances, required_wrench, compliance, cone_edges)
+    reserve = 0.0 if cone_margin is None else cone_margin
+    reduced = largest_disturbance(contacts, disturbances, required_wrench, compliance, cone_edges, reserve)
     solutions: dict[str, FormulationSolution | Solution] = {**unreduced, "21": reduced}
     bindings = {name: Binding(direction=s.direction, contact=s.contact, row=s.row) for name, s in unreduced.items()}
     bindings["21"] = _binding(contacts, reduced, unreduced["16"], cone_edges)
@@ -199,6 +203,7 @@ def specified_disturbances(
     required_wrench: ArrayLike | None = None,
     cone_edges: int = 8,
     force_bound: str | None = None,
+    cone_margin: ArrayLike | None = None,
 ) -> SpecifiedDisturbances:
     """Whether some f_0 holds the object against disturbances that are given outright, and which: (6) or (9)-(10).
 
@@ -214,6 +219,7 @@ def specified_disturbances(
         required_wrench: b (*batch, 6), N and N m; None is zero.
         cone_edges: n_e of (9).
         force_bound: "norm" or "normal"; None is what the equation says.
+        cone_margin: d of (1), N, >= 0: a grasp, a contact or, for (9), a row, as in `formulation_margin`; None is none.
 
     Returns:
         SpecifiedDisturbances with `*batch` axes.
@@ -233,7 +239,8 @@ def specified_disturbances(
     bound = force_bound or ("norm" if exact else "normal")
     formulation = "12" if exact else "13"
     check_vertices(disturbances)
-    found = formulation_margin(contacts, disturbances, formulation, required_wrench, None, cone_edges, bound)
+    given = required_wrench, None, cone_edges, bound
+    found = formulation_margin(contacts, disturbances, formulation, *given, cone_margin=cone_margin)
     margin = found.margin
     tolerance = 1e-7 if margin.dtype == jnp.float64 else 1e-4
     has_margin = (found.status == Status.SOLVED) | (found.status == Status.UNBOUNDED)

@@ -149,7 +149,13 @@ def _rows_of(programs: Programs, lanes: np.ndarray, blocks: np.ndarray) -> _Rows
     loads = -np.einsum("lnma,lnae->lnme", normals, blocks).reshape(-1, 6)
     owners = np.repeat(lanes, len(loads) // len(lanes))
     reach, members = programs.sets.reach(loads, owners)
-    sides = np.concatenate([np.zeros((*friction.shape, _EDGES)), most[..., None]], -1)
+    reserve = np.zeros(())
+    if programs.data.cone_margin is not None:
+        reserve = programs.data.cone_margin if programs.shared.cone_margin else programs.data.cone_margin[lanes]
+    # One value for all grasps, one a grasp, or one a contact.
+    reserve = reserve.reshape(*reserve.shape, *[1] * (2 - reserve.ndim))
+    reserve = np.where(contacts.active[lanes], reserve, 0)[..., None]
+    sides = np.concatenate([np.broadcast_to(-reserve, (*friction.shape, _EDGES)), most[..., None]], -1)
     return _Rows(
         normals,
         reach.reshape(normals.shape[:-1]),

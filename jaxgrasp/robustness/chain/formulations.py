@@ -78,6 +78,7 @@ def formulation_margin(
     cone_edges: int = 8,
     force_bound: str = "normal",
     tolerance: float | None = None,
+    cone_margin: ArrayLike | None = None,
 ) -> FormulationSolution:
     """The largest disturbance by one formulation of the paper's chain.
 
@@ -114,6 +115,8 @@ def formulation_margin(
             norm is no linear row: only exact cones take it, "12_fixed" for boxes and vertices alone.
         tolerance: where directions are refined, how far margin may be below upper_bound, as a share of it; None is 1e-4
             (float32: 1e-2).
+        cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`. Exact cones, which have no
+            rows, keep |f_t| + mu f_n <= -d, so that with the same d inscribed pyramids are inside them. None is none.
 
     Returns:
         FormulationSolution with `*batch` axes.
@@ -139,7 +142,8 @@ def formulation_margin(
     if force_bound == "norm" and not FORMULATIONS[formulation].exact:
         raise ValueError(f"force_bound: got 'norm' for {formulation!r}, wanted 'normal', since pyramids are linear")
     pyramid_facets(cone_edges)
-    given = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    rows = None if FORMULATIONS[formulation].exact else cone_edges
+    given = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin, cone_edges=rows)
     check_tolerance(tolerance)
 
     def solve(data: GraspData) -> FormulationSolution:
@@ -331,8 +335,7 @@ class Chain(Audited):
         solutions = {}
         for name in self.names:
             twin, form = self._twin(name), FORMULATIONS[name]
-            given = form.exact, self.cone_edges, self.norm_bound and form.exact
-            rows = contact_rows(*given, grasps.friction, len(basics.sizes))
+            rows = contact_rows(grasps, basics, form.exact, self.cone_edges, self.norm_bound and form.exact)
             solution = build_solution(grasps, basics, scales[twin], rows, form, solved[twin])
             solutions[name] = solution, solved[twin].point
         return solutions

@@ -130,7 +130,7 @@ def scale_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_ed
     """The programs of one formulation for a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
     count, lanes = basics.disturbed.shape
-    parts = contact_rows(form.exact, cone_edges, norm_bound, grasps.friction, len(basics.sizes))
+    parts = contact_rows(grasps, basics, form.exact, cone_edges, norm_bound)
     identities = [_identity(part.second_order, len(part.h), dtype) * present[:, None] for part in parts]
     if form.free:
         length = jnp.sqrt(lax.stop_gradient(fold(jnp.add, basics.targets * basics.targets)))
@@ -182,28 +182,37 @@ def compute_blocking_forces(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
     return jnp.where(grasps.present > 0, forces, 0)
 
 
-def contact_rows(
-    exact: bool, cone_edges: int, norm_bound: bool, friction: jax.Array, components: int
-) -> list[ConeRows]:
+def contact_rows(grasps: Grasps, basics: Basics, exact: bool, cone_edges: int, norm_bound: bool) -> list[ConeRows]:
     """The rows of a contact, without sigma: friction, then the bound on the force, in which moments do not count."""
+    friction, components = grasps.friction, len(basics.sizes)
     none = jnp.zeros((1, 1, 1, 1, 1), friction.dtype)
-    make = lambda kind, patterns, h, stretch=None: ConeRows(
-        second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch
+    make = lambda kind, patterns, h, stretch=None, reserve=None: ConeRows(
+        second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch, reserve=reserve
     )
     axes = np.eye(components).tolist()
     normal = (0 - np.eye(components)[2]).tolist()
     if not exact:
         facets = contact_facets(cone_edges, components).tolist()
-        return [make(False, [*facets, normal], (*[0.0] * len(facets), 1.0))]
+        reserve = _reserve(grasps, basics, len(facets), 1)
+        return [make(False, [*facets, normal], (*[0.0] * len(facets), 1.0), reserve=reserve)]
     # Of a soft contact the ellipsoid, |(f_t, m mu / gamma)| <= -mu f_n.
     sliding = (0 - np.delete(np.eye(components), 2, 0)).tolist()
-    coulomb = make(True, [axes[2], *sliding], (0.0,) * components)
+    reserve = _reserve(grasps, basics, 1, components - 1)
+    coulomb = make(True, [axes[2], *sliding], (0.0,) * components, reserve=reserve)
     if not norm_bound:
         return [coulomb, make(False, [normal], (1.0,))]
     slip = jnp.maximum(friction, LEAST_FRICTION[friction.dtype.name])[:, None]
     stretch = jnp.stack([slip, slip, jnp.ones_like(slip), slip][:components])
     forces = (-np.eye(components)[:3]).tolist()
     return [coulomb, make(True, [(0.0,) * components, *forces], (1.0, 0.0, 0.0, 0.0), stretch)]
+
+
+def _reserve(grasps: Grasps, basics: Basics, rows: int, others: int) -> jax.Array | None:
+    """What d takes from the first rows of a contact, and nothing from the others: (rows + others, 1, n, 1, *lanes)."""
+    if grasps.reserve is None:
+        return None
+    taken = grasps.row_reserves(basics.sizes[0], rows)
+    return jnp.concatenate([taken, jnp.zeros((others, *taken.shape[1:]), taken.dtype)])[:, None, :, None]
 
 
 def _identity(second_order: bool, rows: int, dtype: jnp.dtype) -> jax.Array:

@@ -83,6 +83,7 @@ def least_total_effort(
     compliance: ArrayLike | None = None,
     effort_weights: ArrayLike | None = None,
     cone_edges: int = 8,
+    cone_margin: ArrayLike | None = None,
 ) -> TotalEffortSolution:
     """Program (11): tightening forces and free answers to every disturbance, of least effort together.
 
@@ -99,6 +100,7 @@ def least_total_effort(
         compliance: Q as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the identity.
         effort_weights: Q_0, as blocks; None is the identity.
         cone_edges: n_e.
+        cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`; None is none.
 
     Returns:
         TotalEffortSolution with `*batch` axes.
@@ -118,7 +120,9 @@ def least_total_effort(
     if compliance is not None and jnp.shape(compliance)[-3:] != blocks:
         wanted = ", ".join(map(str, blocks))
         raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {wanted})")
-    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance)
+    data = GraspData.from_arguments(
+        contacts, disturbances, required_wrench, compliance, cone_margin, cone_edges=cone_edges
+    )
     options = Options(
         margin=as_float("margin", margin, ()), effort_weights=optional_float("effort_weights", effort_weights)
     )
@@ -213,6 +217,7 @@ class _TotalEffort(OfPyramids, Audited):
         # Without a load and disturbances no forces at all are the optimum. What rounding leaves of no wrench counts as
         # none: a grasp that withstands none has no room inside its rows.
         forceless = active & (jnp.abs(problem.rhs) <= _NO_WRENCH[dtype]).all((0, 1))
+        forceless = forceless if grasps.reserve is None else forceless & grasps.reserves_nothing
         out = interior_point.solve(problem, settings, active & ~forceless)
         record = jax.tree.map(lambda v: jnp.where(forceless, 0, v), out.record)
         gap = (record.upper - record.lower) / problem.gap_scale(record)
@@ -274,7 +279,11 @@ def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) 
     largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (rest, change)])
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     targets = jnp.concatenate([basics.load[:, None] - _asked(grasps) * basics.targets, basics.load[:, None]], 1)
-    patterns, h = build_rows(contact_facets(cone_edges, k), dtype, 3)
+    facets = contact_facets(cone_edges, k)
+    patterns, h = build_rows(facets, dtype, 3)
+    if grasps.reserve is not None:
+        reserve = grasps.row_reserves(basics.sizes[0], len(facets))[:, :, None]
+        h = jnp.concatenate([h[:-1] - reserve, jnp.broadcast_to(h[-1:], reserve[:1].shape)])
     problem = ArrowProblem(
         patterns=patterns,
         h=h,

@@ -200,7 +200,9 @@ def _balance(grasps: Grasps, basics: Basics, rest: jax.Array, forces: jax.Array,
 
 
 def _unloaded(grasps: Grasps) -> jax.Array:
-    return (grasps.wrench == 0).all(0)
+    """Whether no forces at all are admissible and bear b, (*lanes)."""
+    unloaded = (grasps.wrench == 0).all(0)
+    return unloaded if grasps.reserve is None else unloaded & grasps.reserves_nothing
 
 
 def _feasibility(

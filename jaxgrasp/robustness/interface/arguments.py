@@ -6,7 +6,7 @@ here but its field.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -21,6 +21,7 @@ from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import Vertices
+from jaxgrasp.robustness.interface.cone_margins import cone_margin_shape
 
 
 @jax.tree_util.register_dataclass
@@ -37,10 +38,12 @@ class GraspData:
     compliance: Float[Array, "..."] | Compliance | None
     """Q as blocks (*batch, contacts, k, k) or full (*batch, k contacts, k contacts), or one for each vertex of the
     disturbance set; None is the identity. k = 3, or 4 for soft contacts."""
-    cone_margin: Float[Array, "*batch"]
-    """d, N: what every facet row keeps in reserve."""
+    cone_margin: Float[Array, "..."] | None
+    """d, N: what the facet rows keep in reserve, one value a grasp, a contact or a row; None is nothing."""
     actuation: Actuation | None
     """The limits and transmission of the hand's actuators; None lets every finger push at will."""
+    cone_edges: int | None = field(default=None, metadata={"static": True})
+    """n_e of the rows that d may tell apart; None where friction cones are exact, or there is no d."""
 
     @classmethod
     def from_arguments(
@@ -49,8 +52,9 @@ class GraspData:
         disturbances: DisturbanceSet,
         required_wrench: ArrayLike | None = None,
         compliance: ArrayLike | Compliance | None = None,
-        cone_margin: ArrayLike = 0.0,
+        cone_margin: ArrayLike | None = 0.0,
         actuation: Actuation | None = None,
+        cone_edges: int | None = None,
     ) -> "GraspData":
         """The public arguments of these names, of the right kinds.
 
@@ -73,8 +77,10 @@ class GraspData:
             disturbances=disturbances,
             required_wrench=optional_float("required_wrench", required_wrench),
             compliance=compliance,
-            cone_margin=as_float("cone_margin", cone_margin, ()),
+            cone_margin=optional_float("cone_margin", cone_margin),
             actuation=actuation,
+            # Soft contacts have twice as many rows.
+            cone_edges=None if cone_edges is None else cone_edges * (contacts.components - 2),
         )
 
 
@@ -156,10 +162,11 @@ def trailing_shapes(data: GraspData, options: Options) -> tuple[GraspData, Optio
         disturbances=None,
         required_wrench=alike(data.required_wrench, (6,)),
         compliance=_compliance_shape(data),
-        cone_margin=Trailing(()),
+        cone_margin=None,
         actuation=actuation,
     )
-    return shapes, replace(alike(options, ()), effort_weights=alike(options.effort_weights, (n, k, k)))
+    option_shapes = replace(alike(options, ()), effort_weights=alike(options.effort_weights, (n, k, k)))
+    return replace(shapes, cone_margin=_cone_margin_shape(data, options, shapes, option_shapes)), option_shapes
 
 
 def lay_out(data: GraspData, options: Options) -> Arguments:
@@ -198,7 +205,11 @@ def lay_out(data: GraspData, options: Options) -> Arguments:
     )
     shared = jax.tree.map(lambda x, shape: shape.lead(x) == (), inputs, shapes)
     contacts = jax.tree.map(lambda _: False, data.contacts)
-    shared = replace(shared, data=replace(shared.data, contacts=contacts))
+    # What belongs to contacts has their axes, so that nobody takes its axes for others.
+    reserve = jax.tree.map(
+        lambda is_shared, shape: is_shared and not shape.shape, shared.data.cone_margin, shapes.data.cone_margin
+    )
+    shared = replace(shared, data=replace(shared.data, contacts=contacts, cone_margin=reserve))
     dtype = data.contacts.positions.dtype
 
     def lay(leaf: jax.Array, shape: Trailing, is_shared: bool) -> jax.Array:
@@ -275,6 +286,17 @@ def _check_jacobian(data: GraspData) -> None:
             f"actuation: got a jacobian of shape {actuation.jacobian.shape}, wanted (*batch, {n}, {k}, n_v), "
             f"one for each of the {n} contacts"
         )
+
+
+def _cone_margin_shape(data: GraspData, options: Options, shapes: GraspData, option_shapes: Options) -> Any:
+    """The shape that d has to end in, parallel to it, see `cone_margin_shape`."""
+    if data.cone_margin is None:
+        return None
+    others = replace(data, contacts=None, disturbances=None, cone_margin=None), options
+    ends = jax.tree.leaves((replace(shapes, contacts=None), option_shapes))
+    leads = [end.lead(leaf) for leaf, end in zip(jax.tree.leaves(others), ends, strict=True)]
+    axes = max(map(len, (data.contacts.batch_shape, data.disturbances.batch_shape, *leads)))
+    return Trailing(cone_margin_shape(data.cone_margin.shape, axes, data.contacts.n_c, data.cone_edges))
 
 
 def _compliance_shape(data: GraspData) -> Any:

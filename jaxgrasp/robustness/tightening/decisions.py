@@ -234,7 +234,7 @@ def _gap_unit(strength: jax.Array, size: jax.Array) -> jax.Array:
 
 def _unloaded(grasps: Grasps, program: ScaledProgram) -> jax.Array:
     """Whether no forces at all meet every row, but for the disturbances, (*lanes)."""
-    unloaded = (program.rhs == 0).all(0) & (grasps.reserve == 0)
+    unloaded = (program.rhs == 0).all(0) & grasps.reserves_nothing
     return unloaded if program.actuators is None else unloaded & (program.actuators.h >= 0).all((0, 1))
 
 

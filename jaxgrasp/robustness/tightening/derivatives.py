@@ -112,11 +112,15 @@ def _to_grasps(grasps: Grasps, rows: RowWeights, cone_edges: int, with_terms: bo
         zero = replace(zero, options=replace(zero.options, effort_weights=rows.weights))
     if rows.margin is not None:
         zero = replace(zero, options=replace(zero.options, margin=rows.margin))
+    assert grasps.reserve is not None
+    reserve = rows.cone
+    while reserve.ndim > grasps.reserve.ndim:
+        reserve = fold(jnp.add, reserve)
     return replace(
         zero,
         friction=rows.friction + friction,
         max_force=-rows.bound,
-        reserve=fold(jnp.add, fold(jnp.add, rows.cone)),
+        reserve=reserve,
         columns=rows.columns + columns,
         wrench=rows.wrench,
         terms=zero.terms if terms is None else terms,

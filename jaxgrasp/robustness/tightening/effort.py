@@ -49,7 +49,7 @@ def least_effort(
         effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the
             identity. For soft contacts (*batch, n_c, 4, 4), as the compliance.
         cone_edges: n_e.
-        cone_margin: d (*batch,), N, >= 0.
+        cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`.
         smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the
             effort, this program's objective. None is the exact optimum.
         actuation: what the hand can do, as in `largest_disturbance`; actuator efforts cost nothing.
@@ -71,7 +71,9 @@ def least_effort(
         Zero for grasps without an answer.
     """
     pyramid_facets(cone_edges)
-    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin, actuation)
+    data = GraspData.from_arguments(
+        contacts, disturbances, required_wrench, compliance, cone_margin, actuation, cone_edges
+    )
     options = Options(
         margin=as_float("margin", margin, ()),
         smoothing=optional_float("smoothing", smoothing),

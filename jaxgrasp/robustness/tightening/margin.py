@@ -54,7 +54,11 @@ def largest_disturbance(
             (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity. For soft contacts 4 in place of
             3, with moments fourth (rad/(N m)); None then counts a moment m as the force m mu / gamma.
         cone_edges: n_e, edges of the friction pyramid, which is inscribed in Coulomb's cone.
-        cone_margin: d (*batch,), N, >= 0: what every facet row keeps in reserve.
+        cone_margin: d, N, >= 0, what facet rows keep in reserve: one value a grasp (*batch,), a contact (*batch, n_c)
+            or a row (*batch, n_c, n_e). Row k is (cos a_k, sin a_k, mu cos(pi/n_e)) f <= -d with a_k = (2 k + 1) pi /
+            n_e from t1: d is the tangential force along that facet that is left before the row gives way. Its number
+            of axes decides: as many as the batch of all other arguments, or less, is one value a grasp, one more a
+            contact, two more a row. `jax.vmap` tries several on one grasp. Values of absent contacts do not count.
         smoothing: kappa (*batch,), > 0, in units of the margin: answer with the central point, where s z = kappa in
             every row, instead of the optimum. Margin and forces are then smooth and unique, and the margin is below
             the optimum by about kappa for every active row. None is the exact optimum.
@@ -83,7 +87,9 @@ def largest_disturbance(
         smoothing all are those of the answer. Exactly zero for grasps without a finite margin.
     """
     pyramid_facets(cone_edges)
-    data = GraspData.from_arguments(contacts, disturbances, required_wrench, compliance, cone_margin, actuation)
+    data = GraspData.from_arguments(
+        contacts, disturbances, required_wrench, compliance, cone_margin, actuation, cone_edges
+    )
     options = Options(smoothing=optional_float("smoothing", smoothing), cutoff=optional_float("cutoff", cutoff))
     found = over_grasps(_LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)
     return with_moments(found[0], contacts)

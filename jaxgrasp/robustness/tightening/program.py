@@ -263,6 +263,7 @@ def _scale_rows(grasps: Grasps, losses: RowLosses, tangential: jax.Array, unit: 
         return sigmas, h, scale, undisturbed
 
     actuators = None if losses.actuators is None or unit is None else losses.actuators / unit
+    assert grasps.reserve is not None
     sigmas, h, scale, undisturbed = scale_rows(
         losses.cone, losses.bound, actuators, tangential, grasps.max_force, grasps.reserve
     )

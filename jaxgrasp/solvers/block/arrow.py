@@ -76,7 +76,7 @@ class ArrowProblem:
     patterns: jax.Array
     """The rows A, (m, k)."""
     h: jax.Array
-    """The right-hand sides of the rows, (m, 1, 1, *1)."""
+    """The right-hand sides of the rows, (m, 1 or n, 1, *1 or *lanes)."""
     columns: jax.Array
     """E, (eq, k, n, 1, *lanes); zero where a row is dropped or a block absent."""
     rhs: jax.Array

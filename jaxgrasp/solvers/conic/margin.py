@@ -31,7 +31,7 @@ _LONGEST_FOLDED = 16
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class ConeRows:
-    """Rows of one kind of cone; only sigma differs between blocks and copies; lanes trail."""
+    """Rows of one kind of cone; only sigma differs between copies; lanes trail."""
 
     second_order: bool = field(metadata={"static": True})
     """Whether the rows of a block and copy are one second-order cone, or an orthant."""
@@ -43,6 +43,8 @@ class ConeRows:
     """The column of lambda, (d, J, n, *lanes); zero where a block is absent."""
     stretch: jax.Array | None = None
     """Factors of the columns of A, (k, n, *lanes); None for 1."""
+    reserve: jax.Array | None = None
+    """What is taken from h, which all copies share: (d, 1, n, *lanes); None for nothing."""
 
     def apply(self, x: jax.Array) -> jax.Array:
         """Compute A x, which all copies share: (k, n, *lanes) -> (d, 1, n, *lanes)."""
@@ -56,9 +58,10 @@ class ConeRows:
         return pulled if self.stretch is None else self.stretch * pulled
 
     def sides(self) -> jax.Array:
-        """Make h an array that broadcasts over the rows, (d, 1, 1, *1)."""
+        """Make h an array that broadcasts over the rows, (d, 1, 1, *1), or (d, 1, n, *lanes) less the reserve."""
         h = literal(np.array(self.h), self.sigma.dtype)
-        return h.reshape(-1, *[1] * (self.sigma.ndim - 1))
+        h = h.reshape(-1, *[1] * (self.sigma.ndim - 1))
+        return h if self.reserve is None else h - self.reserve
 
     def gram(self, w: Scaling) -> list[jax.Array]:
         """Compute the entries 00, 10, 11, 20, 21, 22, .. of A'W^-2 A summed over copies, (n, *lanes) each."""
