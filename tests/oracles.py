@@ -63,9 +63,10 @@ class Grasp:
 
     @cached_property
     def grasp_map(self) -> np.ndarray:
-        """Equation (5): G (6, 3 n_c), contact i contributes [R_i; p_i x R_i]."""
-        moments = np.cross(self.positions[:, :, None], self.frames, axis=1)
-        blocks = np.concatenate([self.frames, moments], axis=1)
+        """Equation (5): G (6, 3 n_c), contact i contributes [R_i; p_i x R_i], its normal alone without friction."""
+        frames = self.frames * np.stack([self.friction > 0] * 2 + [self.friction >= 0], axis=-1)[:, None]
+        moments = np.cross(self.positions[:, :, None], frames, axis=1)
+        blocks = np.concatenate([frames, moments], axis=1)
         if self.torsional is not None:
             arms = self.torsional / np.where(self.friction > 0, self.friction, np.inf)
             turn = np.concatenate([np.zeros((len(arms), 3)), arms[:, None] * self.frames[..., 2]], axis=1)
@@ -104,6 +105,8 @@ class Grasp:
         on_range = self.range_basis.T @ (self.row_scale[:, None] * self.grasp_map)
         targets = self.vertices * self.row_scale @ self.range_basis
         Qs = compliance_matrix(self.compliance, len(self.positions), self.components)
+        felt = np.abs(self.grasp_map).max(0) > 0
+        Qs = np.where(felt[:, None] & felt, Qs, np.eye(len(felt)))
         if Qs.ndim == 2:
             changes = least_norm(on_range, Qs, targets)
         else:
@@ -132,7 +135,12 @@ class Answer:
 
 
 def facet_rows(friction: float, edges: int) -> np.ndarray:
-    """Equation (1): (edges, 3) rows of the pyramid whose edges stand at 2 pi k / edges from t1, on Coulomb's cone."""
+    """Equation (1): (edges, 3) rows of the pyramid whose edges stand at 2 pi k / edges from t1, on Coulomb's cone.
+
+    Without friction they say that a finger does not pull.
+    """
+    if friction == 0:
+        return np.tile([0.0, 0.0, np.cos(np.pi / edges)], (edges, 1))
     k = np.arange(edges)
     edge = friction * np.stack([np.cos(2 * np.pi * k / edges), np.sin(2 * np.pi * k / edges)], axis=-1)
     middle = (edge + np.roll(edge, -1, axis=0)) / 2
@@ -145,6 +153,8 @@ def soft_facet_rows(friction: float, edges: int) -> np.ndarray:
 
     Every facet holds two neighbouring edges and a pole: it is what no edge and no pole exceeds.
     """
+    if friction == 0:
+        return np.tile([0.0, 0.0, np.cos(np.pi / edges), 0.0], (2 * edges, 1))
     angle = 2 * np.pi * np.arange(edges) / edges
     edge = np.stack([friction * np.cos(angle), friction * np.sin(angle), -np.ones(edges), np.zeros(edges)], axis=-1)
     rows = []
@@ -201,11 +211,9 @@ def program(grasp: Grasp, every_direction: bool = False) -> Program:
     tangential = np.where(mu > 0, mu, 1.0) * F
     columns = np.stack([tangential, tangential, F, tangential][: grasp.components], axis=-1).reshape(-1)
     cone_unit = np.repeat(tangential, len(grasp.cone_matrix) // len(F))
-    # Without friction the pyramid's rows do not say that a finger cannot pull, so rows of +E say it.
-    slippery = grasp.normal_matrix[mu == 0]
-    rows = np.vstack([grasp.cone_matrix, -grasp.normal_matrix, slippery])
-    unit = np.concatenate([cone_unit, F, F[mu == 0]])
-    limit = np.concatenate([-grasp.row_margins, F, np.zeros(len(slippery))])
+    rows = np.vstack([grasp.cone_matrix, -grasp.normal_matrix])
+    unit = np.concatenate([cone_unit, F])
+    limit = np.concatenate([-grasp.row_margins, F])
     change = -grasp.force_changes @ rows.T
     sigma = change.reshape(-1) if every_direction else change.max(axis=0)
     cases = len(change) if every_direction else 1
@@ -341,12 +349,15 @@ def actuated_rows(
     `actuation` has jacobian (n_c, 3, n_v), transmission (n_v, n_u), lower and upper (n_u,).
     """
     n_c, joints = len(friction), actuation["jacobian"].shape[-1]
-    J, B = actuation["jacobian"].reshape(3 * n_c, joints), actuation["transmission"]
+    # Without friction a contact has its normal force alone.
+    felt = np.stack([friction > 0, friction > 0, friction >= 0], axis=-1).reshape(-1)
+    G, J, B = G * felt, actuation["jacobian"].reshape(3 * n_c, joints) * felt[:, None], actuation["transmission"]
     count = B.shape[1]
     left, values, _ = np.linalg.svd(B)
     unreached = left[:, np.sum(values > RANK_TOLERANCE * values[0]) :]
     stacked = np.vstack([G, unreached.T @ J.T])
-    root = np.linalg.cholesky(compliance_matrix(compliance, n_c))
+    weights = np.where(felt[:, None] & felt, compliance_matrix(compliance, n_c), np.eye(3 * n_c))
+    root = np.linalg.cholesky(weights)
     star = np.linalg.solve(root.T, np.linalg.pinv(np.linalg.solve(root, stacked.T).T, RANK_TOLERANCE))[:, :6]
     force = -wrenches @ star.T
     effort = force @ J @ np.linalg.pinv(B).T

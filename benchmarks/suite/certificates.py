@@ -16,11 +16,8 @@ def bounds(m: Model, claims: Claims, polish: bool = False) -> tuple[np.ndarray, 
     """
     balanced = balancing(m) if polish else None
     lower, upper = attained(m, claims, balanced), excluded(m, claims, balanced)
-    # Without friction a row that some disturbance loads allows nothing.
-    slippery = (m.active & (m.friction == 0) & (m.S_1.min(-1) < -1e-9 / m.scale[:, None] * m.max_force)).any(-1)
-    # What G does not reach allows nothing, either.
-    lower = np.where(m.set_outside, np.minimum(lower, 0.0), lower)
-    return lower, np.where(slippery | m.set_outside, np.minimum(upper, 0.0), upper)
+    # What G does not reach allows nothing.
+    return tuple(np.where(m.set_outside, np.minimum(bound, 0.0), bound) for bound in (lower, upper))
 
 
 def balancing(m: Model) -> np.ndarray:
@@ -36,11 +33,10 @@ def attained(m: Model, claims: Claims, balanced: np.ndarray | None) -> np.ndarra
         missed = np.einsum("lrs,ls->lr", balanced, m.b - np.einsum("lrcj,lcj->lr", m.G, forces))
         forces = forces + m.radii**2 * np.einsum("lrcj,lr->lcj", m.G, missed)
     cone, bound = m.slacks(forces)
-    tangential = (np.where(m.friction > 0, m.friction, 1.0) * m.max_force)[..., None]
-    pull = np.where(m.friction == 0, -forces[..., 2], np.inf)
-    slack = np.concatenate([cone, bound[..., None], pull[..., None]], axis=-1)
-    sigma = np.concatenate([-m.S_1, m.S_2[..., None], np.zeros_like(pull)[..., None]], axis=-1)
-    unit = np.concatenate([np.broadcast_to(tangential, cone.shape), *[m.max_force[..., None]] * 2], axis=-1)
+    tangential = (m.friction * m.max_force)[..., None]
+    slack = np.concatenate([cone, bound[..., None]], axis=-1)
+    sigma = np.concatenate([-m.S_1, m.S_2[..., None]], axis=-1)
+    unit = np.concatenate([np.broadcast_to(tangential, cone.shape), m.max_force[..., None]], axis=-1)
     felt = sigma * m.scale[:, None, None] > 1e-9 * unit
     ratio = np.where(felt, slack / np.where(felt, sigma, 1.0), np.where(slack >= -1e-9 * unit, np.inf, -np.inf))
     lower = np.where(m.active[..., None], ratio, np.inf).min((1, 2))

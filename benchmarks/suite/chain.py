@@ -48,11 +48,13 @@ class Case:
 
     @cached_property
     def G(self) -> np.ndarray:
-        """(6, size n_c) for forces in units of f_max."""
-        moments = np.cross(self.positions[:, :, None], self.frames, axis=1)
-        blocks = np.concatenate([self.frames, moments], 1)
+        """(6, size n_c) for forces in units of f_max; zero for tangents, and moments, of contacts without friction."""
+        frames = self.frames * np.stack([self.friction > 0] * 2 + [self.friction >= 0], -1)[:, None]
+        moments = np.cross(self.positions[:, :, None], frames, axis=1)
+        blocks = np.concatenate([frames, moments], 1)
         if self.torsional is not None:
-            turn = self.frames[..., 2] * (self.torsional / self.friction)[:, None]
+            arms = self.torsional / np.where(self.friction > 0, self.friction, np.inf)
+            turn = self.frames[..., 2] * arms[:, None]
             blocks = np.concatenate([blocks, np.concatenate([0 * turn, turn], 1)[..., None]], 2)
         blocks = blocks * self.max_force[:, None, None]
         return self.units[:, None] * blocks.transpose(1, 0, 2).reshape(6, -1)
@@ -106,8 +108,10 @@ class Case:
             facets = np.stack(
                 [np.cos(angles), np.sin(angles), np.full(self.edges, mu * np.cos(np.pi / self.edges))], -1
             )
+            # Without friction the finger does not pull.
+            facets = facets if mu > 0 else np.tile([0, 0, 1.0], (self.edges, 1))
             if self.torsional is not None:
-                pole = np.full((self.edges, 1), np.cos(np.pi / self.edges))
+                pole = np.full((self.edges, 1), np.cos(np.pi / self.edges) * (mu > 0))
                 facets = np.vstack([np.hstack([facets, pole]), np.hstack([facets, -pole])])
             blocks.append(np.vstack([facets, -np.eye(self.size)[2:3]]))
         shares = self.cone_margins / self.max_force[:, None]
@@ -120,8 +124,8 @@ class Case:
         shares = np.broadcast_to(self.cone_margins / self.max_force[:, None], (n, 1))[:, 0]
         for i, mu in enumerate(self.friction):
             e = np.eye(self.size * n)[self.size * i : self.size * (i + 1)]
-            sides = -shares[i] * np.eye(self.size)[0]
-            parts.append(("q", np.vstack([mu * e[2], -np.delete(e, 2, 0)]), sides))
+            coulomb = ("q", np.vstack([mu * e[2], -np.delete(e, 2, 0)]), -shares[i] * np.eye(self.size)[0])
+            parts.append(coulomb if mu > 0 else ("l", e[2:3], np.array([-shares[i]])))
             if norm_bound:
                 parts.append(("q", np.vstack([0 * e[:1], -e[:3]]), np.array([1.0, 0, 0, 0])))
             else:

@@ -35,18 +35,17 @@ def _program(m: Model) -> tuple[np.ndarray, ...]:
         # Nothing holds and nothing is held: lambda <= 0.
         return np.ones((1, 1)), np.zeros(1), np.zeros((0, 1)), np.zeros(0)
     mu, F = m.friction[0, on], m.max_force[0, on]
-    tangential = np.where(mu > 0, mu, 1.0) * F
+    tangential = mu * F
     edges, size = len(m.facets), 3 * len(on)
-    A = np.zeros((len(on), edges + 2, size + 1))
+    A = np.zeros((len(on), edges + 1, size + 1))
     for i in range(len(on)):
-        own = slice(3 * i, 3 * i + 3)
-        A[i, :edges, own] = m.facets * [1.0, 1.0, mu[i] * F[i] / tangential[i]]
-        A[i, edges, 3 * i + 2], A[i, edges + 1, 3 * i + 2] = -1.0, 1.0
+        A[i, :edges, 3 * i : 3 * i + 3] = m.facets
+        A[i, edges, 3 * i + 2] = -1.0
     A[:, :edges, -1] = -m.S_1[0, on] / tangential[:, None] * m.scale
     A[:, edges, -1] = m.S_2[0, on] / F * m.scale
     if m.set_outside[0] or not A[..., -1].any():
-        A[:, : edges + 1, -1] = 1.0
-    h = np.zeros((len(on), edges + 2))
+        A[..., -1] = 1.0
+    h = np.zeros((len(on), edges + 1))
     h[:, :edges], h[:, edges] = -m.reserve[0] / tangential[:, None], 1.0
     columns = np.stack([tangential, tangential, F], axis=-1).reshape(-1)
     left, values, right = np.linalg.svd(m.G[0, :, on].transpose(1, 0, 2).reshape(6, -1) * columns, full_matrices=False)

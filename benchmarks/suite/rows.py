@@ -46,13 +46,15 @@ class Model:
     length: np.ndarray
     """(lanes,), root-mean-square distance of the contacts, m; 1 where that is zero."""
     G: np.ndarray
-    """(lanes, 6, n_c, 3); zero where a contact is absent."""
+    """(lanes, 6, n_c, 3); zero where a contact is absent, and for tangents of contacts without friction."""
     b: np.ndarray
     """(lanes, 6)."""
     active: np.ndarray
     """(lanes, n_c)."""
+    smooth: np.ndarray
+    """(lanes, n_c) bool: contacts without friction, which transmit their normal force alone."""
     friction: np.ndarray
-    """(lanes, n_c), 1 where absent."""
+    """(lanes, n_c), 1 where absent or 0: the rows of C then say that a finger does not pull."""
     max_force: np.ndarray
     """(lanes, n_c), 1 where absent."""
     reserve: np.ndarray
@@ -92,7 +94,7 @@ class Model:
     @property
     def radii(self) -> np.ndarray:
         """(lanes, n_c, 3): no admissible force component is larger, while lambda and the reserve are not negative."""
-        tangential = self.friction * self.max_force
+        tangential = np.where(self.smooth, 0.0, self.friction) * self.max_force
         return np.stack([tangential, tangential, self.max_force], axis=-1) * self.active[..., None]
 
     def cone(self, forces: np.ndarray) -> np.ndarray:
@@ -119,9 +121,8 @@ class Model:
         reach = np.where(np.isfinite(margin), margin, 0.0)[:, None]
         spare = (allowed * self.rounding)[:, None] * np.abs(reach)
         over = -(cone + self.S_1 * reach[..., None]).min(-1), self.S_2 * reach - bound
-        # Rows of C without friction do not say that a finger cannot pull.
-        pull = np.where(self.friction == 0, forces[..., 2], 0.0)
-        worst = (np.maximum(np.maximum(*over) - spare, pull)) / self.max_force
+        sideways = np.where(self.smooth, np.abs(forces[..., :2]).max(-1), 0.0)
+        worst = (np.maximum(np.maximum(*over) - spare, sideways)) / self.max_force
         return np.where(self.active, worst, -np.inf).max(-1)
 
 
@@ -129,8 +130,11 @@ def model(lanes: Lanes, rank: np.ndarray, tolerances: Tolerances) -> Model:
     """The rows of sound lanes; where the rank is in doubt, with that which the package says."""
     on = lanes.active
     there = lambda x, other: np.where(on.reshape(*on.shape, *[1] * (x.ndim - 2)), x, other).astype(np.float64)  # noqa: E731
-    friction, max_force = there(lanes.friction, 1.0), there(lanes.max_force, 1.0)
-    length, units, G = grasp_map(there(lanes.positions, 0.0), there(lanes.frames, 0.0), on)
+    smooth, max_force = on & (lanes.friction == 0), there(lanes.max_force, 1.0)
+    friction = np.where(smooth, 1.0, there(lanes.friction, 1.0))
+    frames = there(lanes.frames, 0.0)
+    frames[..., :2] *= ~smooth[..., None, None]
+    length, units, G = grasp_map(there(lanes.positions, 0.0), frames, on)
     b = lanes.wrench.astype(np.float64) * units
 
     left, values, right = np.linalg.svd(G.reshape(len(on), 6, -1), full_matrices=False)
@@ -151,7 +155,7 @@ def model(lanes: Lanes, rank: np.ndarray, tolerances: Tolerances) -> Model:
     unsure = [(x > tolerances.outside[0]) & (x < tolerances.outside[1]) for x in (load, beyond)]
     smallest = np.take_along_axis(values, np.maximum(rank - 1, 0)[:, None], 1)[:, 0]
     condition = np.where(rank > 0, values[:, 0] / np.where(rank > 0, smallest, 1.0), 1.0)
-    tangential = np.where(friction > 0, friction, 1.0) * max_force
+    tangential = friction * max_force
     sigma = np.concatenate([lost[..., :-1] / tangential[..., None], lost[..., -1:] / max_force[..., None]], axis=-1)
     largest = sigma.max((1, 2))
     return Model(
@@ -159,6 +163,7 @@ def model(lanes: Lanes, rank: np.ndarray, tolerances: Tolerances) -> Model:
         G=G,
         b=b,
         active=on,
+        smooth=smooth,
         friction=friction,
         max_force=max_force,
         reserve=lanes.reserve.astype(np.float64),

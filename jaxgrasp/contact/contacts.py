@@ -32,7 +32,7 @@ class Contacts:
     frames: Float[Array, "*batch contacts 3 3"]
     """Contact frames, columns t1, t2, n; n is the object's outward normal, so a finger that pushes has f_n <= 0."""
     friction: Float[Array, "*batch contacts"]
-    """Coulomb's friction coefficient."""
+    """Coulomb's friction coefficient. At exactly 0 a contact transmits its normal force alone."""
     max_force: Float[Array, "*batch contacts"]
     """Largest normal force, N; bounds the normal component (8), not the norm."""
     active: Bool[Array, "*batch contacts"]

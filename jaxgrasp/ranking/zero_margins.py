@@ -26,8 +26,8 @@ _REASONS = {
     "contact": "without contacts",
     "line": "with contacts on one line (as two always are), about which hard contacts do not resist a turn",
     "friction": "without friction",
+    "slippery": "with contacts without friction: they push along their normals alone, and some disturbance needs more",
     "closure": "without force closure: no forces inside the friction cones squeeze the object",
-    "slippery": "with force closure, but with contacts without friction, which take no share of a disturbance",
     "spare": "with force closure, to which the load, the largest forces or the actuators leave no force to spare",
 }
 # Multiples of the disturbances below which a margin is none.
@@ -85,7 +85,11 @@ def why_zero(
 def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) -> jax.Array:
     """The place of each grasp's reason in `_REASONS`."""
     edges = edges_of(contacts, WrenchSpace(cone_edges=cone_edges))
-    G = jnp.moveaxis(edges.grasp_map, -3, -2).reshape(*edges.valid.shape, 6, -1)
+    smooth = edges.present & (jnp.where(edges.present, contacts.friction, 1) == 0)
+    others = [jnp.zeros_like(smooth)] * (edges.grasp_map.shape[-1] - 2)
+    sideways = jnp.stack([smooth, smooth, *others], -1)
+    G = jnp.where(sideways[..., None, :], 0, edges.grasp_map)
+    G = jnp.moveaxis(G, -3, -2).reshape(*edges.valid.shape, 6, -1)
     singular, left = linalg.right_singular(jnp.swapaxes(G, -1, -2))
     # Rows: directions of wrenches, and which of them no contact forces exert.
     directions = jnp.swapaxes(left, -1, -2)
@@ -100,13 +104,12 @@ def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) 
     longest = jnp.sqrt(jnp.max(jnp.sum(W * W, -1), -1))
     closed = jax.vmap(contains_origin)(W / jnp.where(longest > 0, longest, 1)[..., None, None])
 
-    slippery = edges.present & (jnp.where(edges.present, contacts.friction, 1) == 0)
     conditions = {
         "contact": ~edges.present.any(-1),
-        "line": disturbed,
-        "friction": (slippery == edges.present).all(-1),
+        "line": disturbed & ~smooth.any(-1),
+        "friction": (smooth == edges.present).all(-1) & (disturbed | ~closed),
+        "slippery": disturbed,
         "closure": ~closed,
-        "slippery": slippery.any(-1),
         "spare": jnp.ones_like(closed),
     }
     return jnp.argmax(jnp.stack([conditions[reason] for reason in _REASONS]), axis=0)

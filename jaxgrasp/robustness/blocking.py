@@ -49,10 +49,11 @@ def weighted_pseudo_inverse(
 ) -> Float[Array, "*batch rows 6"]:
     """The weighted pseudo-inverse G* = Q^-1 G' (G Q^-1 G')^+ of the grasp map (15).
 
-    G* W are the contact forces that supply the wrench W with the least f' Q f. On a rank-deficient grasp that holds for
-    wrenches in the range of G; of others G* takes the part in the range, projected with moments in units of the
-    root-mean-square distance of the contacts from the centre of mass. Soft contacts have four rows each, the fourth for
-    the moment about the normal, N m.
+    G* W are the contact forces that supply the wrench W with the least f' Q f; contacts without friction have normal
+    forces alone, so their tangents have no columns in G and Q here and rows of 0 in G*. On a rank-deficient grasp that
+    holds for wrenches in the range of G; of others G* takes the part in the range, projected with moments in units of
+    the root-mean-square distance of the contacts from the centre of mass. Soft contacts have four rows each, the fourth
+    for the moment about the normal, N m.
 
     Args:
         contacts: the grasps.
@@ -62,7 +63,7 @@ def weighted_pseudo_inverse(
 
     Returns:
         (*batch, 3 n_c, 6), contact by contact in contact frames, from N and N m in the object frame to N; (*batch, n_d,
-        3 n_c, 6) for one Q a direction. Rows of absent contacts are 0; NaN where the data are not admissible.
+        3 n_c, 6) for one Q a direction. Rows of absent forces are 0; NaN where the data are not admissible.
 
     Raises:
         ValueError: shapes that do not fit.

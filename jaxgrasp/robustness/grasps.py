@@ -39,8 +39,12 @@ class Grasps:
     """(*lanes), bool: all data of the lane are admissible; the others have no contact present."""
     present: jax.Array
     """(n, *lanes), 1 where a contact is there, else 0."""
+    rough: jax.Array
+    """(n, *lanes), 1 where a contact that is there has friction, else 0; see `admit` for those that have none."""
+    turning: jax.Array | None
+    """(n, *lanes), 1 where a contact bears a moment about its normal, else 0; None for hard contacts."""
     friction: jax.Array
-    """(n, *lanes)."""
+    """(n, *lanes); 1 where there is none."""
     max_force: jax.Array
     """(n, *lanes), N."""
     length: jax.Array
@@ -48,8 +52,8 @@ class Grasps:
     units: jax.Array
     """(6, *lanes), what turns wrenches in N and N m to newtons: 1 and 1 / length."""
     columns: jax.Array
-    """(6, k, n, *lanes), the blocks of G; zero where absent. k = 3, or 4 for soft contacts, whose moments are in
-    newtons, see `Contacts.torsional_arms`."""
+    """(6, k, n, *lanes), the blocks of G; zero where absent, and for tangents of contacts without friction. k = 3, or 4
+    for soft contacts, whose moments are in newtons, see `Contacts.torsional_arms`."""
     lined: jax.Array
     """bool (*lanes), all contacts are on one line, exactly: two of them always are. G has rank 5 at most."""
     wrench: jax.Array
@@ -71,6 +75,12 @@ class Grasps:
     """The options of the call, lanes trailing, made safe as well."""
     actuated: Actuated | None
     """The hand's actuators; None where the fingers can push at will."""
+
+    @property
+    def transmits(self) -> jax.Array:
+        """(k, n, *lanes), 1 where a contact transmits force along t1, t2 and n, and a moment about n, else 0."""
+        turning = [] if self.turning is None else [self.turning]
+        return jnp.stack([self.rough, self.rough, self.present, *turning])
 
     @property
     def rows(self) -> jax.Array:
@@ -140,15 +150,25 @@ def admit_all(arguments: Arguments) -> Grasps:
 
 
 def admit(inputs: Inputs) -> Grasps:
-    """Check the data of every lane, lanes trailing, and replace what cannot be used."""
+    """Check the data of every lane, lanes trailing, and replace what cannot be used.
+
+    A contact without friction transmits its normal force alone: its tangents get no columns in G and none in Q and Q_0.
+    Its friction becomes 1: with tangential forces that do nothing, the rows of its pyramid then say that it does not
+    pull, cos(pi / n_e) f_n <= -d, and not 0 <= -d.
+    """
     data, contacts = inputs.data, inputs.data.contacts
     positions, frames, active = contacts.positions, contacts.frames, contacts.active
     load = data.required_wrench
     assert load is not None
     valid = _usable_contacts(contacts)
-    root, vertex_roots, usable = _roots_of_compliance(data.compliance, active)
+    rough = active & (contacts.friction > 0)
+    arms = contacts.torsional_arms
+    turning = None if arms is None else active & (arms > 0)
+    parts = [rough, rough, jnp.broadcast_to(active, rough.shape)]
+    transmits = jnp.stack(parts if turning is None else [*parts, turning], 1)
+    root, vertex_roots, usable = _roots_of_compliance(data.compliance, transmits)
     valid &= usable
-    weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, active, valid)
+    weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, transmits, valid)
     valid &= usable
     valid &= jnp.isfinite(load).all(0)
     if data.cone_margin is not None:
@@ -163,24 +183,25 @@ def admit(inputs: Inputs) -> Grasps:
     length, usable = _length(positions, active & valid, load, inputs.extents)
     valid &= usable
     length = jnp.where(valid, length, 1)
-    present = active & valid
+    present, rough = active & valid, rough & valid
     positions = jnp.where(present, jnp.moveaxis(positions, 1, 0), 0)
-    frames = jnp.where(present, jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
+    frames = jnp.where(jnp.stack([rough, rough, present]), jnp.moveaxis(frames, (1, 2), (0, 1)), 0)
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, load, 0)
-    friction, max_force = (jnp.where(present, x, 1) for x in (contacts.friction, contacts.max_force))
-    arms, lined = contacts.torsional_arms, _lined(positions, present)
+    friction, max_force = jnp.where(rough, contacts.friction, 1), jnp.where(present, contacts.max_force, 1)
+    lined = _lined(positions, present)
     if arms is not None:
-        arms = jnp.where(present, arms, 0)
-        lined &= (arms == 0).all(0)
-        arms = arms / length
+        lined &= (jnp.where(present, arms, 0) == 0).all(0)
+        arms = jnp.where(present, arms, 0) / length
     actuated = None
     if data.actuation is not None:
-        actuated = _admit_actuation(data.actuation, present, valid, length)
+        actuated = _admit_actuation(data.actuation, transmits & valid, valid, length)
         actuated = clip_limits(actuated, friction, jnp.where(present, max_force, 0))
     return Grasps(
         valid=valid,
         present=present.astype(positions.dtype),
+        rough=rough.astype(positions.dtype),
+        turning=None if turning is None else (turning & valid).astype(positions.dtype),
         friction=friction,
         max_force=max_force,
         length=length,
@@ -226,28 +247,28 @@ def _admit_reserve(reserve: jax.Array, present: jax.Array, valid: jax.Array) -> 
 
 
 def _roots_of_compliance(
-    compliance: jax.Array | Compliance | None, active: jax.Array
+    compliance: jax.Array | Compliance | None, transmits: jax.Array
 ) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
     """M with M M' = Q^-1, the same of every vertex of the set, and whether Q is positive definite, (*lanes)."""
-    n = active.shape[0]
+    n = transmits.shape[0]
     if not isinstance(compliance, Compliance):
-        root, usable = inverse_root(_masked(compliance, active), n)
+        root, usable = inverse_root(_masked(compliance, transmits), n)
         return root, None, usable
     # One Q a direction: the directions trail the lanes while the roots are taken.
     last = jnp.moveaxis(compliance.per_vertex, 0, -1)
-    roots, usable = inverse_root(_masked(last, active[..., None]), n)
+    roots, usable = inverse_root(_masked(last, transmits[..., None]), n)
     assert roots is not None
     return None, jnp.moveaxis(roots, -1, 0), usable.all(-1)
 
 
 def _roots_of_weights(
-    weights: jax.Array | None, active: jax.Array, valid: jax.Array
+    weights: jax.Array | None, transmits: jax.Array, valid: jax.Array
 ) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
-    """Q_0 with the identity for absent contacts, R with R'R = Q_0, and whether it is positive definite, (*lanes)."""
-    masked = _masked(weights, active)
+    """Q_0 with the identity for absent forces, R with R'R = Q_0, and whether it is positive definite, (*lanes)."""
+    masked = _masked(weights, transmits)
     if masked is None:
         return None, None, jnp.array(True)
-    usable = inverse_root(masked, active.shape[0])[1]
+    usable = inverse_root(masked, transmits.shape[0])[1]
     definite = jnp.where(valid & usable, masked, jnp.eye(masked.shape[1], dtype=masked.dtype)[..., None])
     roots = linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
     return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
@@ -310,9 +331,9 @@ def _usable_actuation(actuation: Actuation, active: jax.Array) -> jax.Array:
     return usable & ((lower <= upper) & (lower < jnp.inf) & (upper > -jnp.inf)).all(0)
 
 
-def _admit_actuation(actuation: Actuation, present: jax.Array, valid: jax.Array, length: jax.Array) -> Actuated:
+def _admit_actuation(actuation: Actuation, transmits: jax.Array, valid: jax.Array, length: jax.Array) -> Actuated:
     """The actuation in units of the length, harmless in lanes that are not valid."""
-    jacobian = jnp.where(present[:, None, None], actuation.jacobian, 0)
+    jacobian = jnp.where(transmits[:, :, None], actuation.jacobian, 0)
     safe = lambda matrix: jnp.where(valid, matrix, 0)
     return Actuated(
         joints=jnp.moveaxis(jacobian, (2, 1, 0), (0, 1, 2)) / length,
@@ -324,15 +345,20 @@ def _admit_actuation(actuation: Actuation, present: jax.Array, valid: jax.Array,
     )
 
 
-def _masked(matrices: jax.Array | None, active: jax.Array) -> jax.Array | None:
-    """Blocks or full matrices of contacts with the absent ones' rows and columns replaced by the identity's."""
+def _masked(matrices: jax.Array | None, transmits: jax.Array) -> jax.Array | None:
+    """Blocks or full matrices of contacts with the identity's rows and columns for forces that are not transmitted.
+
+    Args:
+        matrices: (n, k, k, *lanes) or (k n, k n, *lanes).
+        transmits: bool (n, k, *lanes).
+    """
     if matrices is None:
         return None
-    full = matrices.shape[0] != active.shape[0]
+    full = matrices.shape[0] != transmits.shape[0]
     eye = jnp.eye(matrices.shape[1], dtype=matrices.dtype).reshape(
-        (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (active.ndim - 1)
+        (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (transmits.ndim - 2)
     )
     if not full:
-        return jnp.where(active[:, None, None], matrices, eye)
-    there = jnp.repeat(active, matrices.shape[0] // active.shape[0], 0)
+        return jnp.where(transmits[:, :, None] & transmits[:, None], matrices, eye)
+    there = transmits.reshape(-1, *transmits.shape[2:])
     return jnp.where(there[:, None] & there[None], matrices, eye)

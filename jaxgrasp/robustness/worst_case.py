@@ -38,7 +38,7 @@ def worst_case(
     """S_1 (17) and S_2 (18): what the worst unit disturbance takes from every row of C f <= -d and -E f <= f_max.
 
     The rows of (19) are then C f_0 - S_1 lambda <= -d, which the paper prints with + for -, and
-    -E f_0 + S_2 lambda <= f_max.
+    -E f_0 + S_2 lambda <= f_max. Without friction a contact's rows of C are cos(pi / n_e) f_n <= -d.
 
     Args:
         contacts: the grasps.

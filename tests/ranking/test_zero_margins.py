@@ -24,7 +24,8 @@ CUBE = np.array([X, -X, [0, 1, 0], [0, -1, 0]])
 ABOVE = np.array([[0.02, 0, 0.03], [-0.02, 0.01, 0.03], [0, -0.02, 0.03], [0.01, 0.01, 0.03]])
 GRASPS = {
     "around": (0.03 * CUBE, CUBE, 0.6, [1, 1, 1, 1]),
-    "slippery": (0.03 * CUBE, CUBE, [0.6, 0.6, 0.6, 0.0], [1, 1, 1, 1]),
+    "slippery": (0.03 * CUBE, CUBE, [0.6, 0.0, 0.0, 0.0], [1, 1, 1, 1]),
+    "one of four slippery": (0.03 * CUBE, CUBE, [0.6, 0.6, 0.6, 0.0], [1, 1, 1, 1]),
     "smooth": (0.03 * CUBE, CUBE, 0.0, [1, 1, 1, 1]),
     "two": (0.03 * CUBE, CUBE, 0.6, [1, 1, 0, 0]),
     "one": (0.03 * CUBE, CUBE, 0.6, [1, 0, 0, 0]),
@@ -46,6 +47,7 @@ GRASPS = {
         (BOX, "slippery", "with contacts without friction"),
         # Whoever says that this one has no margin has a load or actuators.
         (BOX, "around", "leave no force to spare"),
+        (BOX, "one of four slippery", "leave no force to spare"),
         (FORCES, "two", "leave no force to spare"),
     ],
 )
@@ -68,14 +70,14 @@ def some(contacts: jg.Contacts):
 
 
 def test_margins_are_zero_for_the_reasons_told():
-    names = ["two", "one", "above", "smooth", "around"]
+    names = ["two", "one", "above", "smooth", "around", "slippery", "one of four slippery"]
     contacts = stacked(names)
     found = jg.largest_disturbance(contacts, BOX)
     zero = jaxgrasp.ranking.is_zero(np.asarray(found.margin), np.asarray(found.status))
-    np.testing.assert_array_equal(zero, [True, True, True, True, False])
+    np.testing.assert_array_equal(zero, [True, True, True, True, False, True, False])
     lines = why_zero(some(contacts), zero, BOX)
-    assert [line.split()[0] for line in lines] == ["2", "1", "1"] and "on one line" in lines[0]
-    assert why_zero(some(contacts), np.zeros(5, bool), BOX) == []
+    assert [line.split()[0] for line in lines] == ["2", "1", "1", "1"] and "on one line" in lines[0]
+    assert why_zero(some(contacts), np.zeros(7, bool), BOX) == []
 
 
 def test_of_many_zeros_a_part_is_looked_at():

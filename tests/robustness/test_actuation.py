@@ -1,6 +1,6 @@
 """Margins that a hand can produce, against HiGHS and Clarabel with every row written out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import clarabel
 import jax
@@ -92,9 +92,15 @@ def least(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray, margin
     return clarabel.DefaultSolver(P, np.zeros(rows.shape[1]), rows, right, cones, settings).solve().obj_val
 
 
+def without_friction(hand: Hand) -> Hand:
+    """The last contact transmits its normal force alone."""
+    return replace(hand, contacts=replace(hand.contacts, friction=hand.contacts.friction.at[:, -1].set(0)))
+
+
 HANDS = {
     "an actuator a joint": make(3, JOINTS, redundant=False, compliant=False),
     "two joint directions unreached, one reached twice": make(3, JOINTS - 2, redundant=True, compliant=True),
+    "a contact without friction": without_friction(make(3, JOINTS - 2, redundant=True, compliant=True)),
 }
 
 

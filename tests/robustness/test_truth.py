@@ -127,8 +127,8 @@ def few(sample, solved) -> tuple[Lanes, Claims, Claims, np.ndarray, dict]:
 
 
 def moved(claims: Claims, sample: Lanes) -> np.ndarray:
-    """Forces of which one component of one present contact is off by 1e-4 of its max_force."""
-    forces, which = claims.forces.copy(), np.argmax(sample.active, axis=-1)
+    """Forces of which one component of the strongest present contact is off by 1e-4 of its max_force."""
+    forces, which = claims.forces.copy(), np.argmax(np.where(sample.active, sample.max_force, 0), axis=-1)
     row = np.arange(len(claims))
     forces[row, which, 2] -= 1e-4 * sample.max_force[row, which]
     return forces

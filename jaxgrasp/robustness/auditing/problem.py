@@ -18,9 +18,12 @@ from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
 class Problem(NamedTuple):
     """Grasps and what is asked of them; leaves (lanes, ...), or (1, ...) where all lanes share them.
 
-    positions, frames, friction, max_force: as in `Contacts`; zero where a contact is absent, but for max_force, 1.
+    positions, frames, friction, max_force: as in `Contacts`; zero where a contact is absent, but for max_force, 1. A
+        contact without friction has tangents of zero, which do nothing, and friction 1: the rows of C then say that it
+        does not pull.
     arms: (lanes, n), m, moments about the normals per newton of the fourth component of forces; None for hard contacts.
     present: bool (lanes, n).
+    transmits: bool (lanes, n, k), which components of force a contact has: without friction the normal one alone.
     size: (lanes,), m, root-mean-square distance of the contacts from the centre of mass; 1 where that is zero.
     wrench: (lanes, 6), b, N and N m.
     reserve: (lanes, n or 1, n_e or 1), d, N, zero where a contact is absent; None where there is none.
@@ -36,6 +39,7 @@ class Problem(NamedTuple):
     max_force: jax.Array
     arms: jax.Array | None
     present: jax.Array
+    transmits: jax.Array
     size: jax.Array
     wrench: jax.Array
     reserve: jax.Array | None
@@ -66,11 +70,14 @@ def problem_of(arguments: Arguments) -> Problem:
     inputs: Inputs = jax.tree.map(leading, arguments.inputs, arguments.shared)
     data, contacts, compliance = inputs.data, inputs.data.contacts, inputs.data.compliance
     assert data.required_wrench is not None
-    present = contacts.active
+    present, rough = contacts.active, contacts.active & (contacts.friction > 0)
+    arms = contacts.torsional_arms
+    turning = [] if arms is None else [present & (arms > 0)]
+    transmits = jnp.stack([rough, rough, jnp.broadcast_to(present, rough.shape), *turning], -1)
     here = lambda x, other: jnp.where(present.reshape(*present.shape, *[1] * (x.ndim - 2)), x, other)
     positions, friction, max_force = (
         here(contacts.positions, 0),
-        here(contacts.friction, 0),
+        here(jnp.where(rough, contacts.friction, 1), 0),
         here(contacts.max_force, 1),
     )
     count = jnp.maximum(fold_last(jnp.add, present.astype(positions.dtype)), 1)
@@ -81,11 +88,12 @@ def problem_of(arguments: Arguments) -> Problem:
     strongest = jnp.where(present, max_force, 0)
     return Problem(
         positions=positions,
-        frames=here(contacts.frames, 0),
+        frames=jnp.where(transmits[:, :, None, :3], contacts.frames, 0),
         friction=friction,
         max_force=max_force,
-        arms=None if contacts.torsional_arms is None else here(contacts.torsional_arms, 0),
+        arms=None if arms is None else here(arms, 0),
         present=present,
+        transmits=transmits,
         size=largest * jnp.sqrt(jnp.where(square > 0, square, 1)),
         wrench=data.required_wrench,
         reserve=None if data.cone_margin is None else _reserve(data.cone_margin, present),
@@ -98,7 +106,7 @@ def problem_of(arguments: Arguments) -> Problem:
         cutoff=inputs.options.cutoff,
         hand=None
         if data.actuation is None
-        else _hand(data.actuation, here(data.actuation.jacobian, 0), friction, strongest),
+        else _hand(data.actuation, jnp.where(transmits[..., None], data.actuation.jacobian, 0), friction, strongest),
     )
 
 

@@ -92,8 +92,8 @@ def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Ar
     if problem.hand is not None:
         assert rows.effort is not None and used.effort is not None
         right &= (margin * jnp.abs(rows.effort - used.effort).max(1) <= near * effort_unit(problem.hand)).all(-1)
-    # Where the set is said to reach outside, and neither multipliers nor contacts without friction bound the margin.
-    proven = jnp.where(_slips(problem, used), 0, _upper_bound(problem, evidence, used)[0])
+    # Where the set is said to reach outside, and multipliers do not bound the margin.
+    proven = _upper_bound(problem, evidence, used)[0]
     unproven = proven > CLOSED[margin.dtype.name] * natural_scale(problem, used)
     flat = (solution.status == Status.SOLVED) & _claims_flat(solution)
     # Rows of wrenches outside the range mean nothing; where only that makes the margin zero, they have to be outside.
@@ -125,7 +125,7 @@ def _judged(
     status, asked = solution.status, problem.margin
     scale = natural_scale(problem, rows)
     proven, refuted = _upper_bound(problem, evidence, rows)
-    proven = jnp.where(_flat(problem, solution, rows, place), 0, proven)
+    proven = jnp.where(_flat(solution, place), 0, proven)
     holds, attained = _primal(problem, solution, rows)
     slack = CLOSED[dtype] * jnp.maximum(scale, jnp.abs(jnp.where(jnp.isfinite(attained), attained, 0)))
 
@@ -206,7 +206,7 @@ def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[ja
 
 
 def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = None) -> jax.Array:
-    """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size; (lanes,)."""
+    """Whether G f = b, or another wrench (lanes, 6), moments over the grasp's size, by forces that can be; (lanes,)."""
     f, frames = forces, problem.frames
     pushes = frames[..., 0] * f[..., :1] + frames[..., 1] * f[..., 1:2] + frames[..., 2] * f[..., 2:3]
     size = problem.size[:, None]
@@ -226,7 +226,8 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
     # Forces that are nothing but rounding are none.
     largest = jnp.maximum(largest, _sum(jnp.sqrt(_sum(f * f))))
     largest = jnp.maximum(largest, _NOTHING[f.dtype.name] * _max(jnp.where(problem.present, problem.max_force, 0)))
-    return _max(jnp.abs(missing)) <= MISSED[f.dtype.name] * largest
+    possible = _all((f == 0) | problem.transmits, 2)
+    return possible & (_max(jnp.abs(missing)) <= MISSED[f.dtype.name] * largest)
 
 
 def effort_unit(hand: Hand) -> jax.Array:
@@ -305,19 +306,12 @@ def _of_efforts(hand: Hand, evidence: Evidence | Solution, rows: Rows) -> tuple:
     return more, (pull, value), (jnp.abs(residual) * effort_unit(hand)).sum(-1)
 
 
-def _flat(problem: Problem, solution: Solution, rows: Rows, place: Range | None) -> jax.Array:
-    """Where the margin cannot be positive: a contact without friction has to slip, or wrenches lie outside the range.
+def _flat(solution: Solution, place: Range | None) -> jax.Array:
+    """Where the margin cannot be positive: wrenches lie outside the range of G.
 
-    Without S_1 and S_2 of its own the audit takes the solver's word for the latter, where the rank allows it.
+    Without S_1 and S_2 of its own the audit takes the solver's word for it, where the rank allows it.
     """
-    outside = _claims_flat(solution) if place is None else place.disturbance_outside & place.rank_stands
-    return _slips(problem, rows) | outside
-
-
-def _slips(problem: Problem, rows: Rows) -> jax.Array:
-    """Where a contact without friction would have to bear a tangential force, (lanes,)."""
-    loses = _max(rows.cone) > 1e-9 * rows_size(rows)[:, None]
-    return _any((problem.friction <= 0) & problem.present & loses)
+    return _claims_flat(solution) if place is None else place.disturbance_outside & place.rank_stands
 
 
 def _claims_flat(solution: Solution) -> jax.Array:
@@ -351,7 +345,8 @@ def _least(problem: Problem, solution: Solution, rows: Rows) -> jax.Array:
     if problem.weights is None:
         largest, weighed, answered = 1.0, forces, residual
     else:
-        weights = jnp.where(there[:, :, None, None], problem.weights, jnp.eye(forces.shape[-1], dtype=forces.dtype))
+        both = problem.transmits[..., None] & problem.transmits[..., None, :]
+        weights = jnp.where(both, problem.weights, jnp.eye(forces.shape[-1], dtype=forces.dtype))
         largest = _max(jnp.abs(weights), 2)
         weighed, answered = jnp.einsum("...ab,...b->...a", weights, forces), _divided(residual, weights)
     own = 0.5 * _sum(forces * weighed)

@@ -183,7 +183,7 @@ def _weighted(
     if compliance is None:
         return plain.inverse
     n, size = problem.present.shape[-1], rows.shape[1]
-    there = jnp.repeat(problem.present, size // n, -1)
+    there = problem.transmits.reshape(-1, size)
     if compliance.shape[-2:] != (size, size):
         blocks = jnp.eye(n, dtype=rows.dtype)[:, None, :, None] * compliance[:, :, :, None, :]
         compliance = blocks.reshape(blocks.shape[0], size, size)

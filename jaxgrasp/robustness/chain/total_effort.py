@@ -228,7 +228,7 @@ class _TotalEffort(OfPyramids, Audited):
         ).astype(jnp.int32)
         has_forces = active & jnp.isfinite(record.upper)
         where_forces = lambda v: jnp.where(has_forces, v, jnp.nan)
-        forces = jnp.moveaxis(record.x * (basics.sizes * grasps.present)[:, :, None], (2, 1), (0, 1))
+        forces = jnp.moveaxis(record.x * (basics.sizes * grasps.transmits)[:, :, None], (2, 1), (0, 1))
         solution = TotalEffortSolution(
             effort=where_forces(record.upper * unit),
             lower_bound=where_forces(record.lower * unit),

@@ -153,7 +153,7 @@ def build_solution(
     program = worst if scale.shape[0] > 1 else jnp.zeros_like(worst)
     forces, disturbed = _forces(basics, form, out.point.x, directions, margin, program)
     forceless = _unloaded(grasps) & (margin == 0)
-    forces, disturbed = (jnp.where(forceless, 0, x * grasps.present) for x in (forces, disturbed))
+    forces, disturbed = (jnp.where(forceless, 0, x * grasps.transmits) for x in (forces, disturbed))
     # The forces of every direction are on the way from f_0 to the most that the direction allows.
     attained, reached = disturbed, jnp.broadcast_to(margin, directions.shape)
     if form.free:

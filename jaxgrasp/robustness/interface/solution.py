@@ -39,9 +39,10 @@ class Solution:
     """Certified gap: (upper_bound - margin) / max(Lambda, |margin|) for (21), with Lambda the margin's natural scale;
     that of the effort for (22)."""
     rank: Int[Array, "*batch"]
-    """Rank of the grasp map."""
+    """Rank of the grasp map, of contacts without friction with their normals alone."""
     cone_multipliers: Float[Array, "*batch contacts edges"]
-    """z >= 0 of C f_0 - S_1 lambda <= -d; 2 n_e of them for soft contacts."""
+    """z >= 0 of C f_0 - S_1 lambda <= -d, 2 n_e of them for soft contacts; without friction of rows cos(pi / n_e) f_n,
+    see `largest_disturbance`."""
     bound_multipliers: Float[Array, "*batch contacts"]
     """z >= 0 of -E f_0 + S_2 lambda <= f_max."""
     wrench_multipliers: Float[Array, "*batch 6"]

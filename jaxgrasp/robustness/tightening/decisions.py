@@ -118,11 +118,9 @@ def solve_margin(grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Reco
     found = _assess_margin(grasps, program, problem, outcome, settings.tolerance)
     record = outcome.record._replace(lower=found.low, upper=found.high, x=found.x)
 
-    # Margin and bound in units of the disturbances; a contact without friction allows no positive margin.
+    # Margin and bound in units of the disturbances.
     low, scale = found.low, program.scale
     margin, upper = low * scale, found.high * scale
-    margin = jnp.where(program.slippery, jnp.minimum(margin, 0), margin)
-    upper = jnp.where(program.slippery, jnp.minimum(upper, 0), upper)
     upper = jnp.where(found.hopeless & jnp.isinf(low), 0, upper)
     unknown = found.hopeless & ~found.closed | found.pruned & jnp.isinf(low)
     margin = jnp.where(unknown, jnp.nan, margin)
@@ -135,7 +133,7 @@ def solve_margin(grasps: Grasps, program: ScaledProgram) -> tuple[Solution, Reco
     has_margin = ~jnp.isnan(margin)
     where_margin = lambda x: jnp.where(has_margin, x, jnp.nan)
     forces = program.forces(record.x[0]) * program.blocks.present[:, None]
-    other = program.disturbance_outside | program.undisturbed | program.slippery & ((low > 0) | found.forceless)
+    other = program.disturbance_outside | program.undisturbed
     where_optimal = lambda x: jnp.where(~other, x, 0)
     multipliers = where_optimal(record.z[0] * scale / program.row_units())
     actuated = actuated_values(program, record.x, record, grasps.units, scale)
@@ -169,7 +167,6 @@ def margin_cases(grasps: Grasps, program: ScaledProgram, found: _Found) -> list[
         Case(program.wrench_outside, Status.INFEASIBLE, jnp.nan),
         Case(program.doubtful & flat & found.bearable, Status.ILL_CONDITIONED, 0.0),
         Case(flat & found.bearable, Status.SOLVED, 0.0),
-        Case(program.slippery & found.forceless & ~program.doubtful, Status.SOLVED, 0.0),
         Case(program.undisturbed & found.bearable, Status.UNBOUNDED, jnp.inf),
         Case((flat | program.undisturbed) & found.hopeless, Status.INFEASIBLE, jnp.nan),
         Case(found.hopeless, Status.INFEASIBLE),
@@ -260,8 +257,7 @@ def at_centre(
 ) -> Solution:
     """Put the central point in place of the best one; the lane is solved where it is found."""
     point = find_central_point(objective, grasps, program, iterate, possible)
-    margin = jnp.where(program.slippery, jnp.minimum(point.margin, 0), point.margin)
-    values = point._replace(margin=margin)._asdict()
+    values = point._asdict()
     found = values.pop("usable")
     changed = {
         name: jnp.where(found, value, getattr(solution, name)) for name, value in values.items() if value is not None
@@ -310,7 +306,7 @@ def solve_effort(grasps: Grasps, program: ScaledProgram, first: Solution, record
     has_forces = active & jnp.isfinite(best.upper)
     where_forces = lambda x: jnp.where(has_forces, x, jnp.nan)
     attained = jnp.where(program.undisturbed, jnp.inf, attained * program.scale)
-    attained = jnp.where(program.disturbance_outside | program.slippery, 0, attained)
+    attained = jnp.where(program.disturbance_outside, 0, attained)
     forces = program.forces(best.x[0]) * program.blocks.present[:, None]
     multipliers = best.z[0] * unit**2 / program.row_units()
     actuated = actuated_values(program, best.x, best, grasps.units, unit**2)

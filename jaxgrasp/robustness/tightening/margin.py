@@ -43,6 +43,10 @@ def largest_disturbance(
     |f_n|, where the paper's section V-A speaks of the force norm: f_max / sqrt(1 + mu^2) keeps |f| below f_max, too.
     docs/paper.md has what that changes.
 
+    A contact with friction exactly 0 transmits its normal force alone: f_0 and G* have no tangential forces there, Q
+    and Q_0 no rows and columns, and its rows of C are cos(pi / n_e) f_n <= -d, since (1) would let it pull. Fewer than
+    seven such contacts do not close a grasp, but disturbances in the range of their G are withstood.
+
     lambda is left free: where even b cannot be borne the status is INFEASIBLE and a negative margin is the proof. A
     grasp without force closure and without load has margin 0.
 
@@ -84,7 +88,9 @@ def largest_disturbance(
         Of margin (and upper_bound), forces, effort and multipliers with respect to everything that is continuous, of
         any order. The exact margin's gradient is that of the Lagrangian (envelope theorem), at kinks a subgradient;
         that of exact forces belongs to the central point for 1e-6 (float32: 1e-4) of the margin's natural scale. With
-        smoothing all are those of the answer. Exactly zero for grasps without a finite margin.
+        smoothing all are those of the answer. Exactly zero for grasps without a finite margin. At friction 0 the
+        margin jumps, as G* takes tangential forces up: there the derivative by friction is 0, all others are those of
+        the frictionless contact.
     """
     pyramid_facets(cone_edges)
     data = GraspData.from_arguments(

@@ -10,7 +10,7 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.program import ScaledProgram
+from jaxgrasp.robustness.tightening.program import ScaledProgram, force_units
 from jaxgrasp.solvers.block.effort import EffortProblem, least_curvature
 from jaxgrasp.solvers.block.kkt import BlockProblem, Blocks, Rows
 from jaxgrasp.solvers.block.margin import MarginProblem
@@ -41,11 +41,11 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
     blocks, *others = program.groups
     dtype, asked = program.rhs.dtype, grasps.options.margin
     assert asked is not None
-    margin = jnp.where(program.disturbance_outside | program.slippery, 0, asked / program.scale)
+    margin = jnp.where(program.disturbance_outside, 0, asked / program.scale)
     eye = jnp.eye(program.columns.shape[1], dtype=dtype)[..., None, None]
     # H = D Q_0 D = root'root with root = R D, Q_0 = R'R and the units D of forces.
     root = eye if grasps.weight_roots is None else grasps.weight_roots
-    root = root * program.force_units * blocks.present
+    root = root * force_units(program.tangential, program.normal, len(program.columns[0])) * blocks.present
     largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
     largest = jnp.where(largest > 0, largest, 1)
 

@@ -61,6 +61,10 @@ class ScaledProgram:
     """(m, n, *lanes), right-hand sides."""
     present: jax.Array
     """(n, *lanes), 1 or 0."""
+    rough: jax.Array
+    """(n, *lanes), 1 where there is friction, else 0."""
+    turning: jax.Array | None
+    """(n, *lanes), 1 where a contact bears a moment, else 0; None for hard contacts."""
     rhs: jax.Array
     """(eq, *lanes), coordinates of b in the orthonormal rows; zero where dropped."""
     dropped: jax.Array
@@ -89,9 +93,6 @@ class ScaledProgram:
     """bool (*lanes): the set has wrenches outside the range of G."""
     wrench_outside: jax.Array
     """bool (*lanes): b is outside the range of G."""
-    slippery: jax.Array
-    """bool (*lanes): a contact without friction has to bear tangential force, so the margin cannot be positive."""
-
     actuators: ActuatorRows | None
     """What the actuators add; None where there are none."""
     joint_sizes: jax.Array | None
@@ -125,13 +126,14 @@ class ScaledProgram:
 
     @property
     def force_units(self) -> jax.Array:
-        """The units of scaled forces, (k, n, *lanes), N: along the normal F, along the surface and of moments mu F."""
-        return force_units(self.tangential, self.normal, self.columns.shape[1])
+        """What scaled forces are worth, (k, n, *lanes), N: along the normal F, else mu F, or nothing without friction."""
+        tangential = self.tangential * self.rough
+        turning = [] if self.turning is None else [self.tangential * self.turning]
+        return jnp.stack([tangential, tangential, self.normal, *turning])
 
     def forces(self, x: jax.Array) -> jax.Array:
         """Turn scaled forces (k, n, *lanes) into contact forces (n, k, *lanes), N."""
-        units = [self.tangential, self.tangential, self.normal, self.tangential]
-        return jnp.stack([x_a * unit for x_a, unit in zip(x, units, strict=False)], 1)
+        return jnp.swapaxes(x * self.force_units, 0, 1)
 
     def row_units(self) -> jax.Array:
         """The unit of every scaled row, (m, n, *lanes), N."""
@@ -198,6 +200,8 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
         sigma=rows.sigma,
         h=rows.h,
         present=present,
+        rough=grasps.rough,
+        turning=grasps.turning,
         rhs=coordinates * kept,
         dropped=1 - kept,
         scale=rows.scale,
@@ -212,7 +216,6 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
         undisturbed=rows.undisturbed,
         disturbance_outside=reach > tolerance,
         wrench_outside=wrench_outside,
-        slippery=((grasps.friction <= 0) & (fold(jnp.maximum, losses.cone) > 0)).any(0),
         actuators=actuators,
         joint_sizes=equalities.joint_sizes,
     )
@@ -337,9 +340,10 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
     more than rounding turns the others by more than 1e-7.
 
     In float32 a row that is nearly dependent makes S_1 and S_2 wrong by eps over what was left of it. One that was
-    dropped may be dependent or not, unless the contacts themselves say so: all on one line, to the last bit. A
-    disturbance set that leaves the range by little more than rounding has margin 0, or none of it at all. Rows of
-    joints that no actuator reaches are dependent where they look so.
+    dropped may be dependent or not, unless the contacts themselves say so: all on one line, to the last bit, or, some
+    without friction, with fewer components of force than rows, or with nothing at all left of a row. A disturbance set
+    that leaves the range by little more than rounding has margin 0, or none of it at all. Rows of joints that no
+    actuator reaches are dependent where they look so.
     """
     ratios, kept = basis.ratios, basis.kept > 0
     if ratios.dtype == jnp.float64:
@@ -351,6 +355,8 @@ def _doubtful(grasps: Grasps, basis: Basis, reach: jax.Array, tolerance: float) 
         dependent = (most * least <= rounding) & (least > 1e-8)
         return (least * second <= rounding) | (most > _MOST_TURNED * least) & ~dependent
     short = (kept[:6] & (ratios[:6] < 3e-3)).any(0)
-    doubtful = short | (~kept[:6].all(0) & ~grasps.lined)
+    rows, smooth = fold(jnp.add, kept[:6].astype(ratios.dtype)), (grasps.rough < grasps.present).any(0)
+    certain = (rows == fold(jnp.add, fold(jnp.add, grasps.transmits))) | (kept[:6] | (ratios[:6] == 0)).all(0)
+    doubtful = short | (~kept[:6].all(0) & ~grasps.lined & ~(smooth & certain))
     doubtful |= (reach > 64 * jnp.finfo(reach.dtype).eps) & (reach <= tolerance)
     return doubtful if len(ratios) == 6 else doubtful | ((ratios[6:] > 1e-5) & (ratios[6:] < 1e-3)).any(0)
