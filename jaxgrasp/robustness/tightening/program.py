@@ -126,7 +126,7 @@ class ScaledProgram:
 
     @property
     def force_units(self) -> jax.Array:
-        """What scaled forces are worth, (k, n, *lanes), N: along the normal F, else mu F, or nothing without friction."""
+        """What scaled forces are worth, (k, n, *lanes), N: along the normal F, else mu F, 0 without friction."""
         tangential = self.tangential * self.rough
         turning = [] if self.turning is None else [self.tangential * self.turning]
         return jnp.stack([tangential, tangential, self.normal, *turning])
