@@ -109,7 +109,7 @@ class Case:
                 [np.cos(angles), np.sin(angles), np.full(self.edges, mu * np.cos(np.pi / self.edges))], -1
             )
             # Without friction the finger does not pull.
-            facets = facets if mu > 0 else np.tile([0, 0, 1.0], (self.edges, 1))
+            facets = facets if mu > 0 else np.tile([0, 0, np.cos(np.pi / self.edges)], (self.edges, 1))
             if self.torsional is not None:
                 pole = np.full((self.edges, 1), np.cos(np.pi / self.edges) * (mu > 0))
                 facets = np.vstack([np.hstack([facets, pole]), np.hstack([facets, -pole])])

@@ -417,3 +417,24 @@ def test_slopes_of_forces_and_of_every_shape() -> None:
         ends = [np.asarray(value(jnp.asarray(d + sign * 1e-6 * along))) for sign in (-1, 0, 1)]
         counted = (ends[0] != 0) & (ends[1] != 0) & (ends[2] != 0)
         slopes_agree("21", ends, 1e-6, np.sum((ours * along).reshape(len(batch), -1), -1), counted)
+
+
+@pytest.mark.thorough
+def test_margins_of_contacts_where_directions_are_refined() -> None:
+    """12 >= 12_fixed, 13 >= 16 = 21 for a ball, and a grasp alone is as in a batch."""
+    normals = np.array([[1, 0, 0.1], [-1, 0.1, 0], [0, 1, 0.1], [0.1, -1, -0.1], [0, 0.1, 1.0]])
+    alone = jg.Contacts.from_normals(0.05 * normals, normals, friction=0.8, max_force=5.0)
+    two = jg.Contacts.from_normals(
+        *[np.stack([0.05 * normals] * 2), np.stack([normals] * 2)], friction=0.8, max_force=5
+    )
+    ball, d = jg.DisturbanceSet.ball(1.0, 0.02), np.array([0, 0.05, 0.1, 0.15, 0.2])
+    m = {}
+    for name in ("12", "12_fixed", "13", "16"):
+        m[name] = float(jg.formulation_margin(alone, ball, name, cone_margin=d).margin)
+        both = jg.formulation_margin(two, ball, name, cone_margin=np.stack([d, 0 * d])).margin
+        np.testing.assert_allclose(both[0], m[name], rtol=2e-4)
+        assert both[1] > 1.01 * both[0]
+    row = jg.formulation_margin(alone, ball, "13", cone_margin=np.tile(d[:, None], (1, EDGES))).margin
+    np.testing.assert_allclose(row, m["13"], rtol=2e-4)
+    np.testing.assert_allclose(jg.largest_disturbance(alone, ball, cone_margin=d).margin, m["16"], rtol=1e-6)
+    assert m["12"] > m["12_fixed"] > m["16"] and m["12"] > m["13"] > m["16"]

@@ -152,9 +152,9 @@ def _difference(more: jax.Array, less: jax.Array) -> jax.Array:
 
 def _binding(contacts: Contacts, reduced: Solution, unreduced: FormulationSolution, cone_edges: int) -> Binding:
     """What decides (21), whose rows do not tell the direction: the one that loads the deciding row most."""
-    friction, bound = (
-        jnp.broadcast_to(x, reduced.bound_multipliers.shape) for x in (contacts.friction, contacts.max_force)
-    )
+    # Without friction the rows say that a finger does not pull, see `admit`.
+    friction = jnp.where(contacts.friction == 0, 1, contacts.friction)
+    friction, bound = (jnp.broadcast_to(x, reduced.bound_multipliers.shape) for x in (friction, contacts.max_force))
     z = jnp.concatenate(
         [reduced.cone_multipliers * (friction * bound)[..., None], (reduced.bound_multipliers * bound)[..., None]], -1
     )

@@ -141,6 +141,8 @@ def _rows_of(programs: Programs, lanes: np.ndarray, blocks: np.ndarray) -> _Rows
     """The rows of some lanes, and how far their sets reach along them, for blocks of G* (L, n, 3, 6)."""
     contacts = programs.data.contacts
     friction, most = contacts.friction[lanes].astype(float), contacts.max_force[lanes].astype(float)
+    # Without friction the rows say that a finger does not pull, see `admit`.
+    friction[friction == 0] = 1
     facets = pyramid_facets(_EDGES)
     tangents = np.broadcast_to(facets[:, :2], (*friction.shape, _EDGES, 2))
     normals = np.concatenate([tangents, (friction[..., None] * facets[:, 2])[..., None]], -1)

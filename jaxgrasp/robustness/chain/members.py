@@ -67,7 +67,9 @@ def worst_of_rows(
     inverse = jax.lax.stop_gradient(inverse)
     blocks = inverse.reshape(*inverse.shape[:-2], contacts.n_c, 3, 6)
     rows = literal(pyramid_facets(cone_edges), inverse.dtype)
-    friction = jnp.broadcast_to(jax.lax.stop_gradient(contacts.friction), blocks.shape[:-2])
+    # Without friction the rows say that a finger does not pull, see `admit`.
+    friction = jax.lax.stop_gradient(jnp.where(contacts.friction == 0, 1, contacts.friction))
+    friction = jnp.broadcast_to(friction, blocks.shape[:-2])
     ends = jnp.ones_like(friction)[..., None]
     normals = jnp.concatenate([rows[:, 2] * friction[..., None], -ends], -1)
     tangents = jnp.concatenate([rows[:, :2], jnp.zeros_like(rows[:1, :2])])
