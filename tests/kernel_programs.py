@@ -82,10 +82,11 @@ def formulation(dtype, name, n_c=3, **options):
     return jg.formulation_margin(contacts, vertices, name, load, **options)
 
 
-def total_effort(dtype, n_c=3, moved=lambda c: c, families=FAMILIES):
+def total_effort(dtype, n_c=3, moved=lambda c: c, families=FAMILIES, **options):
     contacts, vertices, load, _ = harness.data_of(batch(n_c, families), dtype)
     wanted = 0.3 * ASKED * contacts.max_force.mean(-1)
-    return jg.least_total_effort(moved(contacts), vertices, wanted, load)
+    options = {name: given(dtype) for name, given in options.items()}
+    return jg.least_total_effort(moved(contacts), vertices, wanted, load, **options)
 
 
 def worst_case(dtype, n_c=3, disturbances=None):
@@ -159,6 +160,7 @@ GROUPS: dict[str, dict[str, Program]] = {
             margin, compliance=lambda dtype: jg.Compliance.per_direction(blocks(12, 3, 3, 3)(dtype))
         ),
         "weights": partial(effort, effort_weights=blocks(LANES, 3, 3, 3)),
+        "full weights": partial(effort, effort_weights=blocks(LANES, 9, 9)),
         "actuators": partial(margin, actuation=actuation),
         "effort, actuators": partial(effort, actuation=actuation),
     },
@@ -170,6 +172,11 @@ GROUPS: dict[str, dict[str, Program]] = {
         "12, norm": partial(formulation, name="12", force_bound="norm"),
         "total effort": total_effort,
         "total effort, 4": partial(total_effort, n_c=4),
+        "total effort, matrices": partial(
+            total_effort,
+            compliance=lambda dtype: jg.Compliance.per_direction(blocks(12, 3, 3, 3)(dtype)),
+            effort_weights=blocks(LANES, 9, 9),
+        ),
         "specified, (6)": partial(specified, kind="6"),
         "specified, (9)": partial(specified, kind="9"),
     },

@@ -13,6 +13,7 @@ from pathlib import Path
 import clarabel
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg import block_diag
 from scipy.optimize import linprog
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "ycb_allegro_grasps.npz"
@@ -201,9 +202,9 @@ def prestrained(case: Case) -> float:
     return _least(rows, np.tile(h, 2), [np.hstack([case.G, np.zeros((6, 1))])] * len(rows), case)
 
 
-def _clarabel(P, cost, rows, cones, equal, sides) -> tuple[str, np.ndarray, float]:
+def _clarabel(P, cost, rows, cones, equal, sides, tolerances=(1e-9, 1e-8)) -> tuple[str, np.ndarray, float]:
     """Rows in the cones (kind, _, h), one after the other; looser where Clarabel stalls."""
-    for tolerance in (1e-9, 1e-8):
+    for tolerance in tolerances:
         found = _clarabel_to(tolerance, P, cost, rows, cones, equal, sides)
         if found[0] in ("Solved", "PrimalInfeasible"):
             break
@@ -399,10 +400,28 @@ def recorded() -> Batch | None:
     )
 
 
-def least_total_effort(case: Case, margin: float) -> float:
-    """(11) with Q = Q_0 = I, N^2; inf where infeasible, nan where Clarabel fails."""
+def least_total_effort(
+    case: Case, margin: float, at_rest: np.ndarray | None = None, changes: np.ndarray | None = None
+) -> float:
+    """(11), N^2; inf where infeasible, nan where Clarabel fails.
+
+    Args:
+        case: a grasp.
+        margin: lambda.
+        at_rest: Q_0, blocks (n_c, 3, 3) or full (3 n_c, 3 n_c); None for the identity.
+        changes: Q, likewise, or one for each direction along the leading axis.
+    """
     (A, h), size, count = case.rows, case.G.shape[1], len(case.W)
-    weights = np.repeat(case.max_force, case.size) ** 2
+    unit = np.repeat(case.max_force, case.size)
+
+    def whole(Q: np.ndarray | None) -> np.ndarray:
+        Q = np.eye(size) if Q is None else block_diag(*Q) if Q.ndim == 3 else Q
+        return unit[:, None] * Q * unit
+
+    k = case.size
+    blocks = (size // k, k, k), (size, size)
+    each = [changes] * count if changes is None or changes.shape in blocks else changes
+    weights = [whole(Q) for Q in (at_rest, *each)]
     # Unknowns f_0, then the changes.
     rows = sp.vstack(
         [
@@ -413,14 +432,15 @@ def least_total_effort(case: Case, margin: float) -> float:
     U = case.independent
     equal = sp.block_diag([U @ case.G] * (count + 1)).tocsr()
     sides = np.concatenate([U @ case.b, *(-margin / case.scale * case.W @ U.T)])
-    scale = weights.max()
+    scale = max(Q.max() for Q in weights)
     status, _, value = _clarabel(
-        sp.diags(np.tile(weights / scale, count + 1)),
+        sp.block_diag([Q / scale for Q in weights]),
         np.zeros((count + 1) * size),
         rows,
         [("l", None, np.tile(h, count + 1))],
         equal,
         sides,
+        (1e-12, 1e-11, 1e-10, 1e-9, 1e-8),
     )
     if status == "Solved":
         return value * scale

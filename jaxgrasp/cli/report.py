@@ -330,6 +330,8 @@ def _table(ranking: Ranking, rows: int, unit: str) -> Table:
 def _counts(ranking: Ranking) -> str:
     counts = {status: int((ranking.status == status).sum()) for status in Status}
     positive = int(((ranking.status == Status.SOLVED) & (ranking.margin > 1e-6)).sum())
-    parts = [f"{count:,} {status.name}" for status, count in counts.items()]
-    parts[0] += f" ({positive:,} with a margin above zero)"
-    return ", ".join(parts)
+    parts = {status: f"{count:,} {status.name}" for status, count in counts.items()}
+    parts[Status.SOLVED] += f" ({positive:,} with a margin above zero)"
+    if counts[Status.MAX_ITERATIONS]:
+        parts[Status.MAX_ITERATIONS] += " (undecided, their margins are lower bounds)"
+    return ", ".join(parts.values())

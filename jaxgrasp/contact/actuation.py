@@ -104,3 +104,29 @@ class Actuation:
         if moments is None:
             return torques
         return torques + jnp.einsum("...iv,...i->...v", self.jacobian[..., 3, :], moments)
+
+    @own_settings()
+    def joint_torque_weights(
+        self, lever: ArrayLike = 1e-3
+    ) -> Float[Array, "*batch contact_components contact_components"]:
+        """Q_0 of (22) for least joint torques: J J', for which f_0'Q_0 f_0 = |J'f_0|^2, the sum of squared torques.
+
+        J J' couples the contacts of a finger, so Q_0 is full. Forces that no joint has to bear cost nothing by it: so
+        that Q_0 is positive definite, a force counts as a torque at the lever.
+
+        Args:
+            lever: (*batch,), > 0, m; small beside the lengths of the fingers, and not below a thousandth of them (in
+                float32, a hundredth).
+
+        Returns:
+            J J' + lever^2 I, (*batch, 3 n_c, 3 n_c), contact by contact in contact frames, for `effort_weights`; of soft
+            contacts (*batch, 4 n_c, 4 n_c), where a moment counts as a torque at the lever per metre.
+
+        Raises:
+            ValueError: shapes that do not fit.
+        """
+        lever = as_float("lever", lever, ()).astype(self.jacobian.dtype)
+        broadcast_batch(jacobian=self.jacobian.shape[:-3], lever=lever.shape)
+        rows = self.jacobian.reshape(*self.jacobian.shape[:-3], -1, self.jacobian.shape[-1])
+        weights = jnp.einsum("...pv,...qv->...pq", rows, rows, precision="highest")
+        return weights + lever[..., None, None] ** 2 * jnp.eye(rows.shape[-2], dtype=rows.dtype)

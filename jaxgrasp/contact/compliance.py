@@ -37,6 +37,11 @@ class Compliance:
         return cls(per_vertex=as_float("compliance", matrices, ("n_d", "3 n_c", "3 n_c")))
 
 
+def is_full(matrices: jax.Array, contacts: int) -> bool:
+    """Whether matrices of n contacts, lanes trailing, are full (k n, k n, *lanes), not blocks (n, k, k, *lanes)."""
+    return matrices.shape[0] != contacts
+
+
 def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array | None, jax.Array]:
     """Compute M with M M' = Q^-1, lanes trailing, and whether Q is symmetric positive definite.
 
@@ -50,7 +55,7 @@ def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array
     """
     if compliance is None:
         return None, jnp.array(True)
-    full = compliance.shape[0] != contacts
+    full = is_full(compliance, contacts)
     axes = (0, 1) if full else (1, 2)
     matrices = jnp.moveaxis(compliance, axes, (-2, -1))
     skew = jnp.abs(matrices - jnp.swapaxes(matrices, -1, -2)).max((-2, -1))
@@ -184,14 +189,14 @@ def pseudo_inverse_adjoint(
 
 def _transposed(root: jax.Array, contacts: int) -> jax.Array:
     """Transpose M, of blocks or full."""
-    return jnp.swapaxes(root, 0, 1) if root.shape[0] != contacts else jnp.swapaxes(root, 1, 2)
+    return jnp.swapaxes(root, 0, 1) if is_full(root, contacts) else jnp.swapaxes(root, 1, 2)
 
 
 def _times_root(columns: jax.Array, root: jax.Array | None) -> jax.Array:
     """Compute G M, (6, k, n, *lanes)."""
     if root is None:
         return columns
-    if root.shape[0] == columns.shape[2]:
+    if not is_full(root, columns.shape[2]):
         return jnp.einsum("rcn...,nca...->ran...", columns, root)
     tall = jnp.einsum("rp...,pq...->rq...", _flatten(columns), root)
     return _unflatten(tall, columns)
@@ -199,7 +204,7 @@ def _times_root(columns: jax.Array, root: jax.Array | None) -> jax.Array:
 
 def _root_times(rows: jax.Array, root: jax.Array) -> jax.Array:
     """Compute M q for every row q, (6, k, n, *lanes)."""
-    if root.shape[0] == rows.shape[2]:
+    if not is_full(root, rows.shape[2]):
         return jnp.einsum("nac...,rcn...->ran...", root, rows)
     return _unflatten(jnp.einsum("pq...,rq...->rp...", root, _flatten(rows)), rows)
 

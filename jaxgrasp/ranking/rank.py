@@ -34,9 +34,9 @@ class Ranking:
     """`Status` of (21)."""
 
     order: Int[np.ndarray, " batch"]
-    """Candidates, the best first: SOLVED and UNBOUNDED by falling margin, then MAX_ITERATIONS, ILL_CONDITIONED and
-    PRUNED, INFEASIBLE and INVALID_INPUT, each by falling margin with NaN last; equals by their number. With metrics:
-    by the first of them, the better ones first and NaN last."""
+    """Candidates, the best first: SOLVED, UNBOUNDED and, by the margin that is certain, MAX_ITERATIONS; then
+    ILL_CONDITIONED and PRUNED, INFEASIBLE and INVALID_INPUT; each by falling margin with NaN last, equals by their
+    number. With metrics: by the first of them, the better ones first and NaN last."""
 
     share: float
     """The part of the margin that the tightening forces below are found for."""
@@ -185,20 +185,26 @@ class _Scores:
             return np.lexsort((np.where(np.isnan(found), 0.0, -found), np.isnan(found)))
         margin, status = self.margin[: self.done], self.status[: self.done]
         group = np.ones(self.done, dtype=int)
-        group[np.isin(status, _ANSWERED)] = 0
+        group[self.certain(slice(self.done))] = 0
         for code, last in _LAST.items():
             group[status == code] = last
         return np.lexsort((np.where(np.isnan(margin), np.inf, -margin), group))  # stable: equals stay in order
 
     def least_of_best(self, top: int) -> float:
         """What a candidate must reach to be among the best so far."""
-        best = self.margin[: self.done][np.isin(self.status[: self.done], _ANSWERED)]
+        best = self.margin[: self.done][self.certain(slice(self.done))]
         return float(np.partition(best, len(best) - top)[len(best) - top]) if len(best) >= top else -np.inf
 
     def bearable(self, rows: np.ndarray) -> np.ndarray:
         # An infinite margin says that nothing disturbs the grasp: what remains to be asked is that it bears its load.
         margin = np.where(self.status[rows] == Status.UNBOUNDED, 0.0, np.maximum(self.margin[rows], 0.0))
-        return np.where(np.isin(self.status[rows], _ANSWERED), margin, np.nan)
+        return np.where(self.certain(rows), margin, np.nan)
+
+    def certain(self, rows: slice | np.ndarray) -> np.ndarray:
+        """Which candidates have a margin that is certain; of those that are undecided it is a lower bound."""
+        status = self.status[rows]
+        undecided = (status == Status.MAX_ITERATIONS) & np.isfinite(self.margin[rows])
+        return np.isin(status, _ANSWERED) | undecided
 
     def ranking(
         self, candidates: Candidates, order: np.ndarray, share: float, answers: list[tuple[np.ndarray, ...]]

@@ -13,7 +13,7 @@ from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.actuation import Actuation
-from jaxgrasp.contact.compliance import Compliance, inverse_root
+from jaxgrasp.contact.compliance import Compliance, inverse_root, is_full
 from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
 from jaxgrasp.disturbance.terms import Term
@@ -65,12 +65,15 @@ class Grasps:
     """The disturbance set, moments in N m; leaves may have lanes of size 1."""
     extents: tuple[jax.Array, ...]
     """The largest |w_i| of every term of the disturbance set, (6, *lanes) each, N and N m."""
+    compliance: jax.Array | None
+    """Q of each vertex of the disturbance set, or one for all, along the leading axis: blocks (n, 3, 3, *lanes) or full
+    (3 n, 3 n, *lanes), the identity for absent contacts; None for Q = I."""
     inverse_root: jax.Array | None
     """M with M M' = Q^-1, see `inverse_root`; None for Q = I."""
     vertex_inverse_roots: jax.Array | None
     """M for each vertex of the disturbance set, along the leading axis."""
     weight_roots: jax.Array | None
-    """(k, k, n, *lanes), R with R'R = Q_0; None for Q_0 = I."""
+    """R with R'R = Q_0, (k, k, n, *lanes) for blocks or (k n, k n, *lanes) for a full Q_0; None for Q_0 = I."""
     options: Options
     """The options of the call, lanes trailing, made safe as well."""
     actuated: Actuated | None
@@ -102,6 +105,12 @@ class Grasps:
         assert self.reserve is not None
         reserve = jnp.where(self.present > 0, self.reserve / unit, 0)
         return jnp.broadcast_to(reserve, (cone_edges, *self.present.shape))
+
+    @property
+    def full_weights(self) -> bool:
+        """Whether Q_0 is one full matrix."""
+        weights = self.options.effort_weights
+        return weights is not None and is_full(weights, len(self.present))
 
 
 def over_grasps(function: BatchedFunction, data: GraspData, options: Options | None = None) -> Any:
@@ -166,7 +175,7 @@ def admit(inputs: Inputs) -> Grasps:
     turning = None if arms is None else active & (arms > 0)
     parts = [rough, rough, jnp.broadcast_to(active, rough.shape)]
     transmits = jnp.stack(parts if turning is None else [*parts, turning], 1)
-    root, vertex_roots, usable = _roots_of_compliance(data.compliance, transmits)
+    compliance, root, vertex_roots, usable = _roots_of_compliance(data.compliance, transmits)
     valid &= usable
     weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, transmits, valid)
     valid &= usable
@@ -212,6 +221,7 @@ def admit(inputs: Inputs) -> Grasps:
         reserve=None if data.cone_margin is None else _admit_reserve(data.cone_margin, present, valid),
         terms=data.disturbances.terms,
         extents=inputs.extents,
+        compliance=compliance,
         inverse_root=root,
         vertex_inverse_roots=vertex_roots,
         weight_roots=weight_roots,
@@ -248,30 +258,37 @@ def _admit_reserve(reserve: jax.Array, present: jax.Array, valid: jax.Array) -> 
 
 def _roots_of_compliance(
     compliance: jax.Array | Compliance | None, transmits: jax.Array
-) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
-    """M with M M' = Q^-1, the same of every vertex of the set, and whether Q is positive definite, (*lanes)."""
+) -> tuple[jax.Array | None, jax.Array | None, jax.Array | None, jax.Array]:
+    """Q, M with M M' = Q^-1, the same of every vertex of the set, and whether Q is positive definite, (*lanes)."""
     n = transmits.shape[0]
+    if compliance is None:
+        return None, None, None, jnp.array(True)
+    definite = lambda Q, usable: jnp.where(usable, Q, jnp.eye(Q.shape[-2], dtype=Q.dtype)[..., None])
     if not isinstance(compliance, Compliance):
-        root, usable = inverse_root(_masked(compliance, transmits), n)
-        return root, None, usable
+        masked = _masked(compliance, transmits)
+        root, usable = inverse_root(masked, n)
+        return definite(masked, usable)[None], root, None, usable
     # One Q a direction: the directions trail the lanes while the roots are taken.
     last = jnp.moveaxis(compliance.per_vertex, 0, -1)
-    roots, usable = inverse_root(_masked(last, transmits[..., None]), n)
-    assert roots is not None
-    return None, jnp.moveaxis(roots, -1, 0), usable.all(-1)
+    masked = _masked(last, transmits[..., None])
+    roots, usable = inverse_root(masked, n)
+    assert roots is not None and masked is not None
+    usable = usable.all(-1)
+    return definite(jnp.moveaxis(masked, -1, 0), usable), None, jnp.moveaxis(roots, -1, 0), usable
 
 
 def _roots_of_weights(
     weights: jax.Array | None, transmits: jax.Array, valid: jax.Array
 ) -> tuple[jax.Array | None, jax.Array | None, jax.Array]:
-    """Q_0 with the identity for absent forces, R with R'R = Q_0, and whether it is positive definite, (*lanes)."""
+    """Q_0, the identity for absent forces and bad lanes, R with R'R = Q_0, and whether it is definite, (*lanes)."""
     masked = _masked(weights, transmits)
     if masked is None:
         return None, None, jnp.array(True)
     usable = inverse_root(masked, transmits.shape[0])[1]
+    axes = (0, 1) if is_full(masked, transmits.shape[0]) else (1, 2)
     definite = jnp.where(valid & usable, masked, jnp.eye(masked.shape[1], dtype=masked.dtype)[..., None])
-    roots = linalg.cholesky(jnp.moveaxis(definite, (1, 2), (-1, -2)))
-    return masked, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
+    roots = linalg.cholesky(jnp.moveaxis(definite, axes, (-1, -2)))
+    return definite, jnp.moveaxis(roots, (-1, -2), (0, 1)), usable
 
 
 def _admit_options(options: Options, valid: jax.Array) -> tuple[Options, jax.Array]:
@@ -354,7 +371,7 @@ def _masked(matrices: jax.Array | None, transmits: jax.Array) -> jax.Array | Non
     """
     if matrices is None:
         return None
-    full = matrices.shape[0] != transmits.shape[0]
+    full = is_full(matrices, transmits.shape[0])
     eye = jnp.eye(matrices.shape[1], dtype=matrices.dtype).reshape(
         (() if full else (1,)) + matrices.shape[1:2] * 2 + (1,) * (transmits.ndim - 2)
     )

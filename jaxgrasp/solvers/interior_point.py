@@ -14,6 +14,7 @@ Source: Mehrotra (1992), "On the implementation of a primal-dual interior point 
 are described in `solve`.
 """
 
+import math
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -40,6 +41,7 @@ class Settings(NamedTuple):
     gap_floor: gaps up to this one count as closed, whatever their scale; the loop then ends near a central point.
     gap_share: no step aims at less than this share of the wanted gap (static): nearer to the boundary rounding spoils
         the Newton system, and with it the stationarity that the bounds need.
+    accepted: a lane that stalls with a larger gap, relative to gap_scale, goes on with care, see `solve` (static).
     """
 
     tolerance: float
@@ -51,6 +53,7 @@ class Settings(NamedTuple):
     patience: int = 3
     gap_floor: float | jax.Array = 0.0
     gap_share: float = 0.0
+    accepted: float = float("inf")
 
 
 class Iterate(NamedTuple):
@@ -145,12 +148,16 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
     finished when its certified bounds have met, or when `patience` steps in a row cut their gap by less than a tenth;
     then it freezes: nothing of it changes any more, whatever its neighbours do. A step that is not finite is not taken.
 
+    A few lanes in a million stall with a gap that is not `accepted`: s z is far below mu in some rows, where the term
+    of second order outgrows the step. They get four times as many steps again, without it and aiming at mu/10 at least.
+
     Args:
         problem: the problem to solve.
         settings: numbers of the loop.
         active: bool (*lanes); the loop does not touch lanes that are False.
     """
     lanes, present = len(problem.lanes), problem.present
+    retries = math.isfinite(settings.accepted)
 
     # Start: mu is the mean of s z over the rows that count.
     iterate = fenced(problem.start)()
@@ -168,8 +175,9 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
             # On the central path the gap is the sum of s z, mu times the number of rows.
             gap_aim = settings.gap_share * settings.tolerance * problem.gap_scale(carry.record)
             least_aim = jnp.maximum(least_aim, gap_aim * inverse_count)
+        careful = carry.stalled >= settings.patience if retries else None
         stepped, mu = _predict_correct(
-            problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count, least_aim
+            problem, settings, carry.iterate, carry.residuals, carry.mu, inverse_count, least_aim, careful
         )
         active = carry.active
         take = active & jnp.isfinite(mu)
@@ -182,14 +190,18 @@ def solve(problem: Problem, settings: Settings, active: jax.Array) -> Outcome:
         improved = gap < 0.9 * carry.best_gap
         # Until both bounds exist there is no gap to stall.
         stalled = jnp.where(improved | jnp.isinf(gap), 0, carry.stalled + 1)
-        closed = gap <= jnp.maximum(settings.tolerance * problem.gap_scale(record), settings.gap_floor)
+        size = problem.gap_scale(record)
+        closed = gap <= jnp.maximum(settings.tolerance * size, settings.gap_floor)
+        given_up = stalled >= settings.patience
+        if retries:
+            given_up &= (gap <= settings.accepted * size) | (stalled >= 5 * settings.patience)
         return _Carry(
             iterate=iterate,
             residuals=residuals,
             record=record,
             best_gap=jnp.where(improved, gap, carry.best_gap),
             stalled=stalled,
-            active=active & ~closed & (stalled < settings.patience),
+            active=active & ~closed & ~given_up,
             iterations=carry.iterations + active.astype(jnp.int32),
             mu=jnp.where(take, mu, carry.mu),
             step=carry.step + 1,
@@ -218,8 +230,9 @@ def _predict_correct(
     mu: jax.Array,
     inverse_count: jax.Array,
     least_aim: float | jax.Array,
+    careful: jax.Array | None,
 ) -> tuple[Iterate, jax.Array]:
-    """Take one step.
+    """Take one step, a careful one in some lanes, see `solve`.
 
     A direction that aims at s z = a in every row has z ds + s dz = a - s z. With the weights w = z/s and the rows' own
     equation ds = -r - A dx this is dz = e + w A dx, with the shift e = w r - z + a/s, which `problem.solve` takes.
@@ -240,7 +253,7 @@ def _predict_correct(
     )
 
     # Corrector, a = sigma mu - ds dz, with the predictor's ds and dz.
-    correct = partial(_correct, affine_shift, inverse_s, present, inverse_count, least_aim, lanes)
+    correct = partial(_correct, affine_shift, inverse_s, present, inverse_count, least_aim, careful, lanes)
     shift = fenced(correct)(iterate, ds, dz, primal, dual, mu)
     dx, dy, rows = problem.solve(factors, residuals, shift)
 
@@ -285,6 +298,7 @@ def _correct(
     present: Tree,
     inverse_count: jax.Array,
     least_aim: float | jax.Array,
+    careful: jax.Array | None,
     lanes: int,
     iterate: Iterate,
     ds: Tree,
@@ -301,7 +315,11 @@ def _correct(
     ratio = ((1 - dual) * mu + (primal - dual) * along + primal * dual * across) / mu
     # sigma mu with Mehrotra's sigma = (mu_aff / mu)^3.
     aim = jnp.maximum(ratio * ratio * ratio * mu, least_aim)
-    return jax.tree.map(lambda e, ds, dz, i, p: e + (aim * p - ds * dz) * i, affine_shift, ds, dz, inverse_s, present)
+    second = jax.tree.map(jnp.multiply, ds, dz)
+    if careful is not None:
+        aim = jnp.where(careful, jnp.maximum(aim, 0.1 * mu), aim)
+        second = jax.tree.map(lambda d: jnp.where(careful, 0, d), second)
+    return jax.tree.map(lambda e, d, i, p: e + (aim * p - d) * i, affine_shift, second, inverse_s, present)
 
 
 def _test_ratios(

@@ -38,6 +38,23 @@ def sum_over_blocks(x: jax.Array) -> jax.Array:
     return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(x, 1, 0)), 1, 0))
 
 
+def flatten(x: jax.Array) -> jax.Array:
+    """Lay the unknowns of blocks, (k, n, ...), behind each other block by block: (k n, ...)."""
+    return jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:])
+
+
+def unflatten(x: jax.Array, k: int) -> jax.Array:
+    """Undo `flatten`: (k n, ...) to blocks of k unknowns, (k, n, ...)."""
+    return jnp.swapaxes(x.reshape(-1, k, *x.shape[1:]), 0, 1)
+
+
+def block_diagonal(blocks: jax.Array) -> jax.Array:
+    """Make one matrix (k n, k n, ...) of its blocks (k, k, n, ...), in the order of `flatten`."""
+    k, _, n = blocks.shape[:3]
+    spread = jnp.einsum("abi...,ij->iajb...", blocks, jnp.eye(n, dtype=blocks.dtype))
+    return spread.reshape(k * n, k * n, *blocks.shape[3:])
+
+
 @fenced
 def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     """Compute A B of matrices (r, c, *lanes) and (c, d, *lanes)."""
@@ -92,6 +109,43 @@ def inverse_cholesky(matrix: jax.Array, floor: jax.Array | None = None) -> jax.A
         return subtract(remainder, inverse, multipliers), subtract(inverse_factor, inverse, multipliers)
 
     return repeat(size, eliminate, (matrix, jnp.broadcast_to(eye, matrix.shape)))[1]
+
+
+def orthonormalise(matrix: jax.Array) -> jax.Array:
+    """Find the upper triangular T for which the columns of M T are orthonormal, by modified Gram-Schmidt.
+
+    With M'M = L L' it is L^-T. M'M itself would square the condition, too much for float32; large rows come first.
+
+    Args:
+        matrix: M, (r, c, *lanes), with independent columns.
+
+    Returns:
+        T, (c, c, *lanes).
+    """
+    rows, size = matrix.shape[:2]
+    index = jnp.arange(size).reshape(size, *[1] * (matrix.ndim - 2))
+    eye = jnp.eye(size, dtype=matrix.dtype).reshape(size, size, *[1] * (matrix.ndim - 2))
+
+    def remove(j: jax.Array, both: jax.Array) -> jax.Array:
+        """Make column j one long, and the later ones orthogonal to it."""
+
+        @fenced
+        def components(both: jax.Array) -> tuple:
+            column = both[:rows, j]
+            square = fold(jnp.add, column * column)
+            inverse = lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))
+            along = fold(jnp.add, both[:rows] * column[:, None]) * inverse
+            return both[:, j] * inverse, along
+
+        @fenced
+        def subtract(both: jax.Array, unit: jax.Array, along: jax.Array) -> jax.Array:
+            moved = both - unit[:, None] * jnp.where(index > j, along, 0)
+            return jnp.where(index == j, unit[:, None], moved)
+
+        return subtract(both, *components(both))
+
+    both = jnp.concatenate([matrix, jnp.broadcast_to(eye, (size, *matrix.shape[1:]))])
+    return repeat(size, remove, both)[rows:]
 
 
 class SmallFactor(NamedTuple):

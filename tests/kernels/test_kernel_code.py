@@ -13,7 +13,12 @@ import pytest
 from jax import lax
 
 from jaxgrasp import kernels
+from jaxgrasp.disturbance.sets import support
+from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.kernels import primitive
+from jaxgrasp.kernels.cpu.module import write_module
+from jaxgrasp.kernels.program.lowering import lower
+from jaxgrasp.lanes.fence import loops
 
 ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 """Relative, for short functions: reciprocals are good to a unit or two in the last place."""
@@ -245,3 +250,27 @@ def test_bits_of_integers_are_left_to_xla(function):
     by_xla = mapped(run, *leaves)
     out = primitive.fused(lambda parts: run(*parts), leaves, (False, False), lambda leaves: mapped(run, *leaves))
     np.testing.assert_array_equal(out[0], by_xla[0])
+
+
+def reach(wrenches, rows):
+    with loops():
+        return support((Vertices(wrenches=wrenches),), rows)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_code_is_as_long_for_many_vertices_as_for_few(shared):
+    def lines(count: int) -> int:
+        jaxpr = jax.make_jaxpr(reach)(jnp.zeros((count, 6, 1)), jnp.zeros((6, 9, 4, 1)))
+        return write_module(lower(jaxpr, [shared, False]), "length", 8, estimates=False).count("\n")
+
+    # All but the pointers into the frame, of which there are a few more where it is large.
+    assert abs(lines(128) - lines(4096)) < 100
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_many_vertices_that_each_problem_has_for_itself(shared):
+    """They need more room than there is on a thread's stack."""
+    wrenches = jnp.asarray(np.random.default_rng(0).normal(size=((1,) if shared else (37,)) + (1024, 6)))
+    turned = jnp.asarray(np.random.default_rng(1).normal(size=(37, 6, 9, 4)))
+    out = fused(reach, wrenches[0] if shared else wrenches, turned, shared=(shared, False))
+    np.testing.assert_allclose(out, np.einsum("lvi,lirc->lvrc", wrenches, turned).max(1), rtol=ROUNDING["float64"])

@@ -11,7 +11,9 @@ import pytest
 
 import jaxgrasp as jg
 from jaxgrasp.candidates import Candidates, concatenate, sample_grasps
+from jaxgrasp.cli.report import _counts
 from jaxgrasp.ranking import RankingInterrupted, rank, ranking_table, write_table
+from jaxgrasp.ranking.rank import _Scores
 
 GRAVITY = 9.81
 # Every shape costs a compilation: tiles and tops of eight are shared by nearly all tests.
@@ -238,3 +240,20 @@ def test_an_older_table_stays_where_a_new_one_fails(ranking, tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(ValueError, match=".xlsx"):
         write_table(ranking, tmp_path / "table.xlsx")
+
+
+def test_what_is_undecided_ranks_by_its_lower_bound():
+    status = [jg.Status.SOLVED, jg.Status.MAX_ITERATIONS, jg.Status.SOLVED, jg.Status.MAX_ITERATIONS]
+    status += [jg.Status.ILL_CONDITIONED, jg.Status.UNBOUNDED]
+    margin = np.array([0.3, 0.25, 0.2, np.nan, 0.9, np.inf])
+    scores = _Scores.none(len(margin), {})
+    scores.fill(slice(len(margin)), margin, margin, np.array(status))
+    np.testing.assert_array_equal(scores.order(), [5, 0, 1, 2, 4, 3])
+    assert scores.least_of_best(3) == 0.25
+    np.testing.assert_array_equal(scores.bearable(np.arange(6)), [0.3, 0.25, 0.2, np.nan, np.nan, 0])
+
+
+def test_the_summary_says_how_many_are_undecided(grasps, ranking):
+    status = np.where(np.arange(COUNT) < 2, jg.Status.MAX_ITERATIONS, ranking.status)
+    told = _counts(replace(ranking, status=status))
+    assert "2 MAX_ITERATIONS (undecided, their margins are lower bounds)" in told

@@ -1,6 +1,7 @@
 """Margins that a hand can produce, against HiGHS and Clarabel with every row written out."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import clarabel
 import jax
@@ -77,8 +78,8 @@ def rows_of(hand: Hand, lane: int) -> tuple:
     )
 
 
-def least(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray, margin: float) -> float:
-    """The effort of (22) by Clarabel."""
+def least(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray, margin: float, weights: np.ndarray) -> float:
+    """The effort of (22) by Clarabel, with a full Q_0."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
@@ -87,9 +88,10 @@ def least(A: np.ndarray, h: np.ndarray, equal: np.ndarray, c: np.ndarray, margin
     equal, c = equal / size[:, None], c / size
     rows = scipy.sparse.csc_matrix(np.vstack([equal, A])[:, :-1])
     cones = [clarabel.ZeroConeT(len(c)), clarabel.NonnegativeConeT(len(h))]
-    P = scipy.sparse.diags((np.arange(rows.shape[1]) < 3 * CONTACTS).astype(float), format="csc")
+    unit = weights.max()
+    P = scipy.sparse.block_diag([np.triu(weights / unit), np.zeros((rows.shape[1] - 3 * CONTACTS,) * 2)], format="csc")
     right = np.concatenate([c, h - A[:, -1] * margin])
-    return clarabel.DefaultSolver(P, np.zeros(rows.shape[1]), rows, right, cones, settings).solve().obj_val
+    return clarabel.DefaultSolver(P, np.zeros(rows.shape[1]), rows, right, cones, settings).solve().obj_val * unit
 
 
 def without_friction(hand: Hand) -> Hand:
@@ -135,8 +137,30 @@ def test_least_effort_is_that_of_clarabel():
     holds = margin > 0
     assert holds.sum() > BATCH / 2
     assert np.all(np.asarray(found.status)[holds] == jg.Status.SOLVED)
-    truth = np.array([least(*rows_of(hand, lane), margin[lane]) for lane in np.flatnonzero(holds)])
+    given = np.eye(3 * CONTACTS)
+    truth = np.array([least(*rows_of(hand, lane), margin[lane], given) for lane in np.flatnonzero(holds)])
     np.testing.assert_allclose(found.effort[holds], truth, rtol=1e-6)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", HANDS)
+def test_least_joint_torques_are_clarabels(name):
+    hand = HANDS[name]
+    margin = 0.75 * np.array([largest_actuated(*rows_of(hand, lane)) for lane in range(BATCH)])
+    solve = partial(jg.least_effort, hand.contacts, PUSHES, np.maximum(margin, 0), **hand.task)
+    weights = np.asarray(hand.actuation.joint_torque_weights())
+    found = solve(effort_weights=weights)
+    holds = margin > 0
+    assert holds.sum() > BATCH / 6
+    assert np.all(np.asarray(found.status)[holds] == jg.Status.SOLVED)
+    truth = np.array([least(*rows_of(hand, lane), margin[lane], weights[lane]) for lane in np.flatnonzero(holds)])
+    unit = 1e-3 * np.abs(weights[holds]).max((1, 2)) * 6.0**2
+    assert np.max(np.abs(found.effort[holds] - truth) / np.maximum(truth, unit)) <= 1e-7
+    # No forces take smaller torques, up to what the lever adds.
+    squares = lambda forces: np.sum(hand.actuation.joint_torques(forces) ** 2, -1)[holds]  # noqa: E731
+    other = solve().forces
+    lever = 1e-6 * np.sum(other**2, (1, 2))[holds]
+    assert np.all(squares(found.forces) <= squares(other) + lever + 1e-9)
 
 
 def moved(hand):

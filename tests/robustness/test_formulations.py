@@ -403,6 +403,8 @@ def test_wrong_arguments_are_named() -> None:
         jg.specified_disturbances(contacts, forces, "10")
     with pytest.raises(ValueError, match="compliance"):
         jg.least_total_effort(contacts, forces, compliance=jnp.eye(9))
+    with pytest.raises(ValueError, match="effort_weights: got shape"):
+        jg.least_total_effort(contacts, forces, effort_weights=jnp.eye(9))
 
 
 @pytest.mark.thorough

@@ -11,9 +11,6 @@ sources and targets of the lanes that are being moved.
 
 from jaxgrasp.kernels.cpu.vectors import Body
 
-# The most bytes of two frames, which are on a thread's stack; where they would be more, no lane waits.
-_MOST_FRAMES = 3 << 17
-
 _ALONE = """
 define internal void @block(ptr %state, i64 %number, ptr %frame, ptr %spill, ptr %queue) {
   call void @before(ptr %state, i64 %number, ptr %frame)
@@ -172,8 +169,8 @@ out:
 
 
 def compacts(body: Body) -> bool:
-    """Tell whether a program has a main loop, and the stack room for a second frame."""
-    return body.has_main_loop and 2 * body.frame_bytes <= _MOST_FRAMES
+    """Tell whether lanes wait in a second frame: they do where there is a main loop."""
+    return body.has_main_loop
 
 
 def write_block(body: Body) -> str:

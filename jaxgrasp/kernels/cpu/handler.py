@@ -28,8 +28,7 @@ declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)
 
 define internal void @take(ptr %state) {
 entry:
-  %frame = alloca [@FRAME_BYTES@ x i8], align 64
-  %spill = alloca [@SPILL_BYTES@ x i8], align 64
+@FRAMES@
   %queue = alloca [@QUEUE_WORDS@ x i64]
   store i64 0, ptr %queue
   %blocks.p = getelementptr i64, ptr %state, i64 1
@@ -63,6 +62,7 @@ counted:
 out:
   call void @finish(ptr %state, ptr %spill, ptr %queue)
   %done = atomicrmw add ptr %done.p, i64 %before release
+@RELEASE@
   ret void
 }
 
@@ -196,6 +196,27 @@ end:
 
 attributes #0 = { nounwind }
 """
+
+# A thread's two frames: on its stack where there is room, else on the heap.
+_MOST_STACK = 3 << 17
+_ON_STACK = """  %frame = alloca [@FRAME_BYTES@ x i8], align 64
+  %spill = alloca [@SPILL_BYTES@ x i8], align 64"""
+_ON_HEAP = """  %bytes = add i64 @FRAME_BYTES@, @SPILL_BYTES@
+  %padded = add i64 %bytes, 64
+  %heap = call ptr @malloc(i64 %padded)
+  %address = ptrtoint ptr %heap to i64
+  %above = add i64 %address, 63
+  %aligned = and i64 %above, -64
+  %frame = inttoptr i64 %aligned to ptr
+  %spill = getelementptr i8, ptr %frame, i64 @FRAME_BYTES@"""
+
+
+def frames(frame_bytes: int, spill_bytes: int) -> dict[str, str]:
+    """Write how a thread gets and releases its two frames, whose sizes are multiples of 64; the marks are HANDLER's."""
+    if frame_bytes + spill_bytes <= _MOST_STACK:
+        return {"FRAMES": _ON_STACK, "RELEASE": ""}
+    return {"FRAMES": _ON_HEAP, "RELEASE": "  call void @free(ptr %heap)"}
+
 
 # Before each block, for tests: no bit of its frame is what it was, nor of the second one where no lane waits there.
 SPOIL = """  %waiting = load i64, ptr %queue

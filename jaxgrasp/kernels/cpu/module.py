@@ -9,7 +9,7 @@ import math
 from jaxgrasp.kernels.code import llvm
 from jaxgrasp.kernels.code.ffi import fill
 from jaxgrasp.kernels.cpu.compaction import compacts, write_block
-from jaxgrasp.kernels.cpu.handler import API_BYTES, HANDLER, POINTERS, SPOIL
+from jaxgrasp.kernels.cpu.handler import API_BYTES, HANDLER, POINTERS, SPOIL, frames
 from jaxgrasp.kernels.cpu.packing import Result, pack_arguments, write_unpack, write_unpack_rows
 from jaxgrasp.kernels.cpu.vectors import Body, VectorCode
 from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
@@ -18,8 +18,8 @@ from jaxgrasp.kernels.program.schedule import schedule
 
 # JAX's name of the devices.
 PLATFORM: str = "cpu"
-# Bytes of a block's arguments and results, which are on a thread's stack.
-_MOST_STACK = 1 << 19
+# Bytes of a block's arguments and results in a thread's frame.
+_MOST_BYTES = 1 << 25
 # The most blocks that a thread takes at a time.
 _CHUNK = 16
 # Vector registers for values, by the bytes of a vector: AVX-512 has 32 registers, others have 16.
@@ -72,14 +72,17 @@ def write_module(program: ScalarProgram, name: str, width: int, *, estimates: bo
     write_unpack(code, results)
     if compacts(body):
         write_unpack_rows(code, results)
+    frame_bytes = max(body.frame_bytes, 64)
+    spill_bytes = frame_bytes if compacts(body) else 64
     values = {
+        **frames(frame_bytes, spill_bytes),
         "NAME": f"@{name}",
         "API_BYTES": API_BYTES,
         "FUNCTIONS": code.text(),
         "BLOCK": write_block(body),
         "SPOIL": SPOIL if spoilt else "",
-        "FRAME_BYTES": max(body.frame_bytes, 64),
-        "SPILL_BYTES": body.frame_bytes if compacts(body) else 64,
+        "FRAME_BYTES": frame_bytes,
+        "SPILL_BYTES": spill_bytes,
         "QUEUE_WORDS": 1 + 3 * width,
         "DECLARATIONS": "\n".join(sorted(code.declarations)),
         "STATE_BYTES": 8 * (POINTERS + len(program.inputs) + len(program.outputs)),
@@ -98,8 +101,8 @@ def _check_size(program: ScalarProgram, width: int) -> None:
         if dtype.kind in "iu" and dtype.itemsize != 4:
             raise Unsupported(f"arguments or results of type {dtype}")
     own = sum(math.prod(s) for (s, _), shared in zip(program.inputs, program.shared, strict=True) if not shared)
-    if (own + sum(x.size for x in program.outputs)) * width * program.builder.dtype.itemsize > _MOST_STACK:
-        raise Unsupported("data too large for a thread's stack")
+    if (own + sum(x.size for x in program.outputs)) * width * program.builder.dtype.itemsize > _MOST_BYTES:
+        raise Unsupported("data too large for a thread's frame")
 
 
 def _write_body(code: VectorCode) -> tuple[list[Result], Body]:

@@ -9,19 +9,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxprs_in_params
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxgrasp.kernels.program.entries import array, aval_of, common_kind, fold_constants, objects
 from jaxgrasp.kernels.program.expressions import Address, Builder, Region, Unsupported, Value, kind_of
 from jaxgrasp.kernels.program.rules import ELEMENTWISE, RULES
+from jaxgrasp.kernels.program.unrolling import MOST_ENTRIES, entries_of, may_unroll
 
-# Unroll limits, in rounds: of any loop, since the first round often starts from zeros and nobody reads all that the
-# last one leaves; of loops whose body reads the counter; of loops that stack results.
-_SHORT, _COUNTED, _STACKED = 2, 16, 64
 # The type of the operands of operations that have instructions for one type alone.
 _ONLY = {"div": "f", "abs": "f", "and": "b", "or": "b", "xor": "b", "not": "b"}
-# The most entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
-_MOST_ENTRIES = 400_000
 
 
 @dataclass(eq=False)
@@ -99,7 +95,7 @@ def lower(jaxpr: ClosedJaxpr, shared: list[bool]) -> ScalarProgram:
     floats |= {np.dtype(aval_of(v).dtype) for v in jaxpr.jaxpr.invars if kind_of(aval_of(v).dtype) == "f"}
     if len(floats) != 1 or not floats <= {np.dtype("float32"), np.dtype("float64")}:
         raise Unsupported(f"floating types {floats}")
-    if _entries(jaxpr.jaxpr) > _MOST_ENTRIES:
+    if entries_of(jaxpr.jaxpr) > MOST_ENTRIES:
         raise Unsupported("too many operations")
     lowering = _Lowering(Builder(floats.pop()))
     inputs = []
@@ -115,17 +111,6 @@ def lower(jaxpr: ClosedJaxpr, shared: list[bool]) -> ScalarProgram:
     outputs = lowering.run(jaxpr.jaxpr, consts, inputs)
     avals = lambda vs: [(tuple(aval_of(v).shape), np.dtype(aval_of(v).dtype)) for v in vs]
     return ScalarProgram(lowering.builder, avals(jaxpr.jaxpr.invars), shared, outputs, avals(jaxpr.jaxpr.outvars))
-
-
-def _entries(jaxpr: Jaxpr) -> int:
-    """Count the entries of all arrays that are computed, in a loop once for each round that may be unrolled."""
-    total = 0
-    for eqn in jaxpr.eqns:
-        total += sum(math.prod(aval_of(v).shape) for v in eqn.outvars)
-        length = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
-        inner = sum(_entries(j) for j in jaxprs_in_params(eqn.params))
-        total += inner * (length if length <= _STACKED else 1)
-    return total
 
 
 class _Lowering:
@@ -194,7 +179,7 @@ class _Lowering:
         # Integers that only count rounds are not carried: they are the loop's counter and where they start.
         counters = _counters(body.jaxpr, n_consts, n_carry, carry)
         counted = xs or any(used for _, used in counters.values())
-        if length <= _SHORT or (counted and length <= _COUNTED) or (n_ys and length <= _STACKED):
+        if may_unroll(params, bool(counted)):
             return self.unroll(params, consts, carry, xs)
         if n_ys or reverse:
             raise Unsupported("a long loop with stacked results")

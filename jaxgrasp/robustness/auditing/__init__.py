@@ -5,6 +5,7 @@ answer claims and takes `Status.SOLVED` away where it does not stand.
 """
 
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,10 +15,12 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxgrasp.compiling import compiled
+from jaxgrasp.lanes.fence import fences
 from jaxgrasp.robustness.auditing import setting
-from jaxgrasp.robustness.auditing.problem import every, picked
+from jaxgrasp.robustness.auditing.parts import once
+from jaxgrasp.robustness.auditing.problem import every
 from jaxgrasp.robustness.auditing.setting import audit
-from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, lay_out
+from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs, Options, lay_out
 
 __all__ = ["Audited", "audit", "audited", "hidden"]
 
@@ -94,21 +97,36 @@ def audited(
 def _verdicts(
     kernel: Any, stride: int, data: GraspData, options: Options, out: Tree, turn: jax.Array
 ) -> tuple[Tree, jax.Array]:
-    """What the kernel judges, (*batch), and how many answers failed."""
+    """What the kernel judges, (*batch), and whether an answer failed."""
     arguments = lay_out(data, options)
     lead = len(arguments.batch)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), out)
-    lanes = jax.tree.leaves(flat)[0].shape[0]
-    verdicts = kernel.judge(arguments, flat, stride == 1)
-    if stride > 1:
-        # Where it is known only when an exported program runs how many there are, all are looked at.
-        step = stride if isinstance(lanes, int) and lanes > _SMALL else 1
-        some = jax.tree.map(lambda x: every(x, turn % step, step), flat)
-        spots = kernel.spot(picked(arguments, turn % step, step), some)
-        refuted = partial(_refuted, turn=turn % step, step=step)
-        verdicts = jax.tree.map(refuted, verdicts, spots, is_leaf=lambda x: hasattr(x, "failed"))
-    failed = jnp.sum(jnp.stack([jnp.sum(verdict) for verdict in _flags(verdicts)]))
+    with fences(jax.default_backend() == "cpu"):
+        verdicts = kernel.judge(arguments, flat, stride == 1)
+        if stride > 1:
+            verdicts = _spotted(kernel, stride, arguments, flat, verdicts, turn)
+    failed = jnp.stack([flag.any() for flag in _flags(verdicts)]).any()
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), verdicts), failed
+
+
+def _spotted(kernel: Any, stride: int, arguments: Arguments, out: Tree, verdicts: Tree, turn: jax.Array) -> Tree:
+    """The verdicts with what comes out anew for one lane in `stride`."""
+    lanes = jax.tree.leaves(out)[0].shape[0]
+    # Where it is known only when an exported program runs how many there are, all are looked at.
+    step = stride if isinstance(lanes, int) and lanes > _SMALL else 1
+
+    @once
+    def pick(inputs: Inputs, out: Tree, turn: jax.Array) -> tuple[Inputs, Tree]:
+        one = lambda x, shared: x if shared else every(x, turn, step)
+        return jax.tree.map(one, inputs, arguments.shared), jax.tree.map(lambda x: every(x, turn, step), out)
+
+    @once
+    def spot(inputs: Inputs, out: Tree) -> Tree:
+        return kernel.spot(replace(arguments, inputs=inputs), out)
+
+    spots = spot(*pick(arguments.inputs, out, turn % step))
+    refuted = partial(_refuted, turn=turn % step, step=step)
+    return jax.tree.map(refuted, verdicts, spots, is_leaf=lambda x: hasattr(x, "failed"))
 
 
 _JUDGES = {

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.disturbance.vertices import wrenches_of
+from jaxgrasp.robustness.auditing.multipliers import CLOSED, reserves
 from jaxgrasp.robustness.auditing.problem import Problem
-from jaxgrasp.robustness.auditing.pyramids import CLOSED, MISSED, balanced, row_values
+from jaxgrasp.robustness.auditing.pyramids import MISSED, balanced, row_values
 from jaxgrasp.robustness.auditing.rows import own_inverse
 from jaxgrasp.solvers.conic.margin import ConicMargin, ConicPoint, inner
 
@@ -45,8 +46,9 @@ def admissible(problem: Problem, forces: jax.Array, exact: bool, cone_edges: int
             within &= jnp.sqrt((forces[..., :3] ** 2).sum(-1)) <= most + slack
     else:
         cone = row_values(problem, forces, cone_edges)[0]
-        cone = cone if problem.reserve is None else cone + problem.reserve
-        within = (cone <= slack[..., None]).all(-1)
+        if problem.reserve is not None:
+            cone = [row + kept for row, kept in zip(cone, reserves(problem, cone_edges), strict=True)]
+        within = fold(jnp.logical_and, [row <= slack for row in cone])
     return ((within & (-normal <= most + slack)) | ~problem.present).all(-1)
 
 

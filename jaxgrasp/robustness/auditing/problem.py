@@ -1,10 +1,10 @@
 """The data of the grasps as the audit sees them: the public arguments, lanes leading, in newtons and metres."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxgrasp.arrays import fold_last
 from jaxgrasp.contact.actuation import Actuation
@@ -18,9 +18,9 @@ from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
 class Problem(NamedTuple):
     """Grasps and what is asked of them; leaves (lanes, ...), or (1, ...) where all lanes share them.
 
-    positions, frames, friction, max_force: as in `Contacts`; zero where a contact is absent, but for max_force, 1. A
-        contact without friction has tangents of zero, which do nothing, and friction 1: the rows of C then say that it
-        does not pull.
+    positions, frames: as in `Contacts`; whatever is given where a contact is absent.
+    friction, max_force: as in `Contacts`; 0 and 1 where a contact is absent. A contact without friction has friction 1:
+        the rows of C then say that it does not pull.
     arms: (lanes, n), m, moments about the normals per newton of the fourth component of forces; None for hard contacts.
     present: bool (lanes, n).
     transmits: bool (lanes, n, k), which components of force a contact has: without friction the normal one alone.
@@ -75,11 +75,8 @@ def problem_of(arguments: Arguments) -> Problem:
     turning = [] if arms is None else [present & (arms > 0)]
     transmits = jnp.stack([rough, rough, jnp.broadcast_to(present, rough.shape), *turning], -1)
     here = lambda x, other: jnp.where(present.reshape(*present.shape, *[1] * (x.ndim - 2)), x, other)
-    positions, friction, max_force = (
-        here(contacts.positions, 0),
-        here(jnp.where(rough, contacts.friction, 1), 0),
-        here(contacts.max_force, 1),
-    )
+    positions = here(contacts.positions, 0)
+    friction, max_force = here(jnp.where(rough, contacts.friction, 1), 0), here(contacts.max_force, 1)
     count = jnp.maximum(fold_last(jnp.add, present.astype(positions.dtype)), 1)
     # In units of the largest, whose square may be more, or less, than there are numbers for.
     largest = fold_last(jnp.maximum, jnp.abs(positions), 2)
@@ -87,8 +84,8 @@ def problem_of(arguments: Arguments) -> Problem:
     square = fold_last(jnp.add, (positions / largest[:, None, None]) ** 2, 2) / count
     strongest = jnp.where(present, max_force, 0)
     return Problem(
-        positions=positions,
-        frames=jnp.where(transmits[:, :, None, :3], contacts.frames, 0),
+        positions=contacts.positions,
+        frames=contacts.frames,
         friction=friction,
         max_force=max_force,
         arms=None if arms is None else here(arms, 0),
@@ -139,19 +136,17 @@ def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_fo
     )
 
 
-def picked(arguments: Arguments, turn: jax.Array, stride: int) -> Arguments:
-    """The arguments of one lane in `stride`, see `every`."""
-    pick = lambda x, shared: x if shared else every(x, turn, stride)
-    return replace(arguments, inputs=jax.tree.map(pick, arguments.inputs, arguments.shared))
-
-
 def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:
     """Lane `turn` of every `stride` lanes; what is left over at the end is not looked at."""
     blocks = x[: x.shape[0] // stride * stride].reshape(-1, stride, *x.shape[1:])
     return jax.lax.dynamic_index_in_dim(blocks, turn, 1, keepdims=False)
 
 
-def facets(problem: Problem, cone_edges: int) -> jax.Array:
+def facets(problem: Problem, cone_edges: int) -> np.ndarray:
     """The facet rows for unit friction: (n_e, 3), of soft contacts (2 n_e, 4)."""
-    components = 3 if problem.arms is None else 4
-    return jnp.asarray(contact_facets(cone_edges, components), problem.friction.dtype)
+    return contact_facets(cone_edges, 3 if problem.arms is None else 4)
+
+
+def edges_of(problem: Problem, cone: jax.Array) -> int:
+    """n_e, from numbers of every facet (..., facets)."""
+    return cone.shape[-1] if problem.arms is None else cone.shape[-1] // 2

@@ -19,7 +19,8 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import wrenches_of
-from jaxgrasp.lanes.fence import fenced, fences
+from jaxgrasp.lanes.fence import fences
+from jaxgrasp.robustness.auditing.parts import cross, once
 from jaxgrasp.robustness.auditing.problem import Problem, facets
 
 # Shares of the longest row between which a row may count as independent or not: there the solver's word is taken.
@@ -29,7 +30,7 @@ _DOUBTFUL = {"float64": (1e-13, 1e-6), "float32": (1e-7, 3e-3)}
 class Rows(NamedTuple):
     """What the worst unit disturbance takes from every row; lanes lead.
 
-    cone: (lanes, n, n_e), -S_1, N; 2 n_e of soft contacts.
+    cone: (lanes, n, n_e), -S_1, N.
     bound: (lanes, n), S_2, N.
     effort: (lanes, 2, n_u), of u <= u_max and -u <= -u_min; None without actuators.
     """
@@ -67,13 +68,13 @@ def own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, 
 
 
 def _own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows, Range]:
-    rows = fenced(_stacked_rows)(problem)
+    rows = once(_stacked_rows)(problem)
     # Where rows of the joints stand below those of G the solver does not tell their rank.
     told = rank if rows.shape[0] == 6 else None
     plain = echelon(rows, told)
     if problem.per_vertex is None:
         inverse = _weighted(rows, problem, problem.compliance, told, plain)
-        found = fenced(lambda problem, inverse: _reached(problem, inverse, cone_edges))(problem, inverse)
+        found = once(lambda problem, inverse: _reached(problem, inverse, cone_edges))(problem, inverse)
     else:
 
         def answered(vertex: tuple) -> Rows:
@@ -83,11 +84,11 @@ def _own_rows(problem: Problem, cone_edges: int, rank: jax.Array) -> tuple[Rows,
 
         vertices = (jnp.moveaxis(problem.per_vertex, 1, 0), wrenches_of(problem.terms))
         found = jax.tree.map(lambda x: jnp.maximum(x.max(0), 0), lax.map(answered, vertices))
-    return found, fenced(_range)(problem, plain)
+    return found, once(_range)(problem, plain)
 
 
 def own_inverse(problem: Problem) -> jax.Array:
-    """G* of wrenches in N and N m, (k n, 6, lanes); for one compliance, or none."""
+    """G* of wrenches in N and N m, (3 n, 6, lanes); for one compliance, or none."""
     rows = _stacked_rows(problem)
     inverse = _weighted(rows, problem, problem.compliance, None, echelon(rows, None))
     return inverse[:, :6] * _units(problem.size)
@@ -95,25 +96,18 @@ def own_inverse(problem: Problem) -> jax.Array:
 
 def _stacked_rows(problem: Problem) -> jax.Array:
     """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, k n, lanes)."""
-    arms = jnp.broadcast_to(problem.positions[:, :, :, None], problem.frames.shape)
-    blocks = jnp.concatenate([problem.frames, cross(arms, problem.frames, 2) / problem.size[:, None, None, None]], 2)
+    frames = jnp.moveaxis(problem.frames, (2, 1, 3, 0), (0, 1, 2, 3))
+    arms = jnp.moveaxis(problem.positions, (2, 1, 0), (0, 1, 2))[:, :, None]
+    blocks = jnp.concatenate([frames, jnp.stack(cross(list(arms), list(frames))) / problem.size])
     if problem.arms is not None:
-        torsion = problem.frames[..., 2] * (problem.arms / problem.size[:, None])[..., None]
-        torsion = jnp.concatenate([jnp.zeros_like(torsion), torsion], -1)
-        blocks = jnp.concatenate([blocks, torsion[..., None]], -1)
-    rows = jnp.moveaxis(blocks, (2, 1, 3, 0), (0, 1, 2, 3)).reshape(6, -1, blocks.shape[0])
+        torsion = frames[:, :, 2:] * (problem.arms.T / problem.size)[:, None]
+        blocks = jnp.concatenate([blocks, jnp.concatenate([jnp.zeros_like(torsion), torsion])], 2)
+    rows = jnp.where(jnp.moveaxis(problem.transmits, 0, -1), blocks, 0).reshape(6, -1, blocks.shape[-1])
     hand = problem.hand
     if hand is None or hand.unreached is None:
         return rows
     bare = jnp.einsum("lrv,liav->rial", *_alike(hand.unreached, hand.jacobian)) / problem.size
     return jnp.concatenate([rows, bare.reshape(bare.shape[0], -1, bare.shape[-1])])
-
-
-def cross(a: jax.Array, b: jax.Array, axis: int) -> jax.Array:
-    """The cross product, spelt out: it then becomes part of what is around it."""
-    a, b = jnp.moveaxis(a, axis, 0), jnp.moveaxis(b, axis, 0)
-    product = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    return jnp.stack(product, axis)
 
 
 def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
@@ -133,41 +127,45 @@ def echelon(rows: jax.Array, rank: jax.Array | None) -> Echelon:
     # The rows and, beside them, the row operations that led to them; a row that is done is a unit vector, or zero.
     rows = jnp.concatenate([rows, none + jnp.eye(count, dtype=dtype)[:, :, None]], 1)
 
-    @fenced
+    @once
     def chosen(rows: jax.Array, left: jax.Array, squares: jax.Array) -> tuple:
-        pivot = jnp.argmax(jnp.where(left, squares, -1), 0) == jnp.arange(count)[:, None]
+        squares = jnp.where(left, squares, -1)
+        longest = squares == fold(jnp.maximum, squares)
+        earlier = [longest[0] & False]
+        for row in longest[:-1]:
+            earlier.append(earlier[-1] | row)
+        pivot = longest & ~jnp.stack(earlier)
         return pivot, fold(jnp.add, jnp.where(pivot[:, None], rows, 0))
 
-    @fenced
+    @once
     def remainder(rows: jax.Array, row: jax.Array, shares: jax.Array) -> jax.Array:
         return row - fold(jnp.add, shares[:, None] * rows)
 
-    @fenced
+    @once
     def scaled(row: jax.Array, length: jax.Array, kept: jax.Array) -> jax.Array:
         inverse = jnp.where(kept, 1 / jnp.where(length > 0, length, 1), 0)
         return jnp.concatenate([row[:width] * inverse, row[width:] * jnp.where(kept, inverse, 1)])
 
-    @fenced
-    def without(rows: jax.Array, unit: jax.Array, shares: jax.Array, pivot: jax.Array) -> jax.Array:
-        return jnp.where(pivot[:, None], unit, rows - shares[:, None] * unit)
-
-    products = fenced(lambda rows, row: _products(rows[:, :width], row[..., :width, :]))
+    products = once(lambda rows, row: _products(rows[:, :width], row[..., :width, :]))
 
     def step(j: jax.Array, state: tuple) -> tuple:
         rows, left, done, stands = state
         pivot, row = chosen(rows, left, products(rows, rows))
         row = remainder(rows, row, jnp.where(left, 0, products(rows, row)))
-        length = fenced(lambda row: jnp.sqrt(fold(jnp.add, row[:width] ** 2)))(row)
+        length = once(lambda row: jnp.sqrt(fold(jnp.add, row[:width] ** 2)))(row)
         kept = length > RANK_TOLERANCE[dtype.name] * longest if rank is None else j < rank
         stands &= jnp.where(kept, length > least, length <= most)
         unit = scaled(row, length, kept)
         left &= ~pivot
-        rows = without(rows, unit, jnp.where(left, products(rows, unit), 0), pivot)
-        return rows, left, done | pivot & kept, stands
+        shares = jnp.where(left, products(rows, unit), 0)
+        rows = jnp.where(pivot[:, None], unit, rows - shares[:, None] * unit)
+        # The order of the rows is of no account. XLA would write over what it reads, and that takes twice as long.
+        rows, left, done = (x[::-1] for x in (rows, left, done | pivot & kept))
+        return rows, left, done, stands
 
     rows, _, kept, stands = lax.fori_loop(0, count, step, (rows, left, ~left, stands))
     units, operations = rows[:, :width], rows[:, width:]
-    inverse = fenced(lambda a, b: fold(jnp.add, a[:, :, None] * b[:, None]))(units, operations)
+    inverse = once(lambda a, b: fold(jnp.add, a[:, :, None] * b[:, None]))(units, operations)
     return Echelon(inverse, jnp.where(kept[:, None], 0, operations), stands | (rank is None))
 
 
@@ -179,7 +177,7 @@ def _products(rows: jax.Array, row: jax.Array) -> jax.Array:
 def _weighted(
     rows: jax.Array, problem: Problem, compliance: jax.Array | None, rank: jax.Array | None, plain: Echelon
 ) -> jax.Array:
-    """G* (k n, r, lanes) for a compliance with lanes leading; None for Q = I."""
+    """G* (3 n, r, lanes) for a compliance with lanes leading; None for Q = I."""
     if compliance is None:
         return plain.inverse
     n, size = problem.present.shape[-1], rows.shape[1]
@@ -196,32 +194,36 @@ def _weighted(
 
 
 def _reached(problem: Problem, inverse: jax.Array, cone_edges: int, wrench: jax.Array | None = None) -> Rows:
-    """What the set, or a single wrench (6, lanes), takes from every row, given G* (k n, r, lanes)."""
+    """What the set, or a single wrench (6, lanes), takes from every row, given G* (3 n, r, lanes)."""
     n, lanes = problem.present.shape[-1], inverse.shape[-1]
     units = _units(problem.size)
     # (6, n, lanes) each: the rows of G* for tangents and normal, and for moments.
     answers = inverse[:, :6].reshape(n, -1, 6, lanes)
     first, second, normal, *moment = jnp.moveaxis(answers, (1, 2), (0, 1)) * units[:, None]
-    c, s, k, *pole = facets(problem, cone_edges).T[:, :, None, None]
-    slip = jnp.moveaxis(problem.friction, 0, -1)
-    cone = -(c * first[:, None] + s * second[:, None] + k * (slip * normal)[:, None])
+    # The rows of C and, after them, of -E: XLA puts arrays together a number at a time.
+    pattern = facets(problem, cone_edges)
+    rows = np.concatenate([pattern, 0 - np.eye(pattern.shape[1])[2:3]])
+    slip = jnp.where(jnp.arange(len(rows))[:, None, None] < len(pattern), problem.friction.T, 1)
+    c, s, k, *pole = jnp.asarray(rows, inverse.dtype).T[:, :, None, None]
+    taken = c * first[:, None] + s * second[:, None] + k * slip * normal[:, None]
     for p, m in zip(pole, moment, strict=True):
-        cone = cone - p * m[:, None]
-    parts = [cone.reshape(6, -1, lanes), normal]
+        taken = taken + p * m[:, None]
+    parts = [-taken.reshape(6, -1, lanes)]
     if problem.hand is not None:
         hand = problem.hand
         torque = jnp.einsum("liav,iacl->lvc", hand.jacobian, answers)
         effort = jnp.einsum("luv,lvc->cul", *_alike(hand.inverse, torque)) * units[:, None]
         parts += [-effort, effort]
-    directions = jnp.concatenate(parts, 1)
+    directions = jnp.concatenate(parts, 1) if len(parts) > 1 else parts[0]
     if wrench is None:
         reach = support(problem.terms, directions)
     else:
         reach = (directions * wrench[:, None]).sum(0)
-    cone, bound, *efforts = jnp.split(reach, np.cumsum([part.shape[1] for part in parts])[:-1])
+    reach, *efforts = jnp.split(reach, np.cumsum([part.shape[1] for part in parts])[:-1])
+    reach = jnp.where(problem.present[:, :, None], jnp.moveaxis(reach.reshape(-1, n, lanes), (0, 2), (2, 0)), 0)
     return Rows(
-        cone=jnp.where(problem.present[:, :, None], jnp.moveaxis(cone.reshape(-1, n, lanes), (0, 2), (2, 0)), 0),
-        bound=jnp.where(problem.present, bound.T, 0),
+        cone=reach[..., :-1],
+        bound=reach[..., -1],
         effort=jnp.moveaxis(jnp.stack(efforts), -1, 0) if efforts else None,
     )
 

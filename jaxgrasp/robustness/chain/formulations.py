@@ -329,7 +329,7 @@ class Chain(Audited):
         basics, scaled = self._scaled(grasps)
         selected = {name: select_programs(grasps, basics, own, FORMULATIONS[name].free) for name, own in scaled.items()}
         scales = {name: own.scale for name, own in scaled.items()}
-        return (replace(grasps, terms=(), extents=()), basics, scales), selected
+        return (replace(grasps, terms=(), extents=(), compliance=None), basics, scales), selected
 
     def _solutions(self, scaled_grasps: tuple, solved: dict[str, ConicOutcome]) -> dict:
         grasps, basics, scales = scaled_grasps

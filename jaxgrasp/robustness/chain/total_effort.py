@@ -8,9 +8,9 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxgrasp import linalg
-from jaxgrasp.arrays import as_float, fold
+from jaxgrasp.arrays import as_float
 from jaxgrasp.compiling import compiled
+from jaxgrasp.contact.compliance import Compliance, is_full
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import contact_facets, pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
@@ -37,6 +37,7 @@ from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.arrow import ArrowProblem, build_rows
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.interior_point import Settings
+from jaxgrasp.solvers.small_matrices import flatten
 from jaxgrasp.solvers.status import Status
 
 _FREE = FORMULATIONS["13"]
@@ -58,7 +59,7 @@ class TotalEffortSolution:
     """The result of `least_total_effort`."""
 
     effort: Float[Array, "*batch"]
-    """The optimum: 1/2 f_0' Q_0 f_0 + sum_j 1/2 delta f_j' Q delta f_j; NaN where there is no answer."""
+    """The optimum: 1/2 f_0' Q_0 f_0 + sum_j 1/2 delta f_j' Q_j delta f_j; NaN where there is no answer."""
     lower_bound: Float[Array, "*batch"]
     """Certified by multipliers: no forces do with less."""
     forces: Float[Array, "*batch contacts 3"]
@@ -80,14 +81,14 @@ def least_total_effort(
     disturbances: DisturbanceSet,
     margin: ArrayLike = 1.0,
     required_wrench: ArrayLike | None = None,
-    compliance: ArrayLike | None = None,
+    compliance: ArrayLike | Compliance | None = None,
     effort_weights: ArrayLike | None = None,
     cone_edges: int = 8,
     cone_margin: ArrayLike | None = None,
 ) -> TotalEffortSolution:
     """Program (11): tightening forces and free answers to every disturbance, of least effort together.
 
-    min 1/2 f_0' Q_0 f_0 + sum_j 1/2 delta f_j' Q delta f_j over (f_0, delta f_1 .. delta f_nd) subject to G f_0 = b,
+    min 1/2 f_0' Q_0 f_0 + sum_j 1/2 delta f_j' Q_j delta f_j over (f_0, delta f_1 .. delta f_nd) subject to G f_0 = b,
     G delta f_j = -margin W_j, and the rows of the pyramids and of |f_n| <= f_max for f_0 and for every f_0 + delta f_j.
 
     Solves (13) first, which says whether there are such forces, and where to start.
@@ -97,8 +98,10 @@ def least_total_effort(
         disturbances: W_j, a single `DisturbanceSet.vertices` or `.forces`.
         margin: (*batch,), >= 0: what the disturbances are scaled by.
         required_wrench: b (*batch, 6), N and N m; None is zero.
-        compliance: Q as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the identity.
-        effort_weights: Q_0, as blocks; None is the identity.
+        compliance: Q of (14), contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3), full
+            (*batch, 3 n_c, 3 n_c), or one Q_j a direction, `Compliance.per_direction`; None is the identity. Full ones
+            take dense linear algebra for every direction.
+        effort_weights: Q_0, blocks or full; None is the identity.
         cone_edges: n_e.
         cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`; None is none.
 
@@ -116,10 +119,6 @@ def least_total_effort(
     """
     pyramid_facets(cone_edges)
     check_vertices(disturbances)
-    blocks = (contacts.n_c, contacts.components, contacts.components)
-    if compliance is not None and jnp.shape(compliance)[-3:] != blocks:
-        wanted = ", ".join(map(str, blocks))
-        raise ValueError(f"compliance: got shape {jnp.shape(compliance)}, wanted blocks (*batch, {wanted})")
     data = GraspData.from_arguments(
         contacts, disturbances, required_wrench, compliance, cone_margin, cone_edges=cone_edges
     )
@@ -258,25 +257,36 @@ def _asked(grasps: Grasps) -> jax.Array:
     return grasps.options.margin
 
 
+def _scaled_weights(matrices: jax.Array | None, sizes: jax.Array, present: jax.Array) -> jax.Array:
+    """D Q D with copies before the lanes, (k, k, n, 1 or n_d, *lanes) or (k n, k n, 1 or n_d, *lanes).
+
+    Args:
+        matrices: Q, blocks (1 or n_d, n, k, k, *lanes) or full (1 or n_d, k n, k n, *lanes); None for the identity.
+        sizes: D, (k, n, *lanes).
+        present: (n, *lanes).
+    """
+    k, n = sizes.shape[:2]
+    if matrices is not None and is_full(matrices[0], n):
+        flat, there = flatten(sizes), jnp.repeat(present, k, 0)
+        eye = jnp.eye(k * n, dtype=sizes.dtype)[..., None]
+        scaled = (matrices + jnp.swapaxes(matrices, 1, 2)) / 2 * flat[:, None] * flat * (there[:, None] * there)
+        return jnp.moveaxis(scaled + eye * (1 - there), 0, 2)
+    eye = jnp.broadcast_to(jnp.eye(k, dtype=sizes.dtype)[..., None, None], (k, k, *present.shape))
+    if matrices is None:
+        return (eye * sizes[:, None] * sizes * present + eye * (1 - present))[:, :, :, None]
+    blocks = jnp.moveaxis((matrices + jnp.swapaxes(matrices, 2, 3)) / 2, (2, 3, 1, 0), (0, 1, 2, 3))
+    across = lambda x: jnp.expand_dims(x, -1 - (present.ndim - 1))
+    scaled = blocks * across(sizes[:, None]) * across(sizes) * across(present)
+    return scaled + across(eye * (1 - present))
+
+
 def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) -> tuple[ArrowProblem, jax.Array]:
     """(11) in scaled forces, and the unit of effort."""
-    dtype, present, weights = basics.sizes.dtype, grasps.present, grasps.options.effort_weights
-    k = len(basics.sizes)
-    eye = jnp.broadcast_to(jnp.eye(k, dtype=dtype)[..., None, None], (k, k, *present.shape))
-
-    def scaled(blocks: jax.Array | None) -> jax.Array:
-        """D Q D."""
-        blocks = eye if blocks is None else blocks
-        return blocks * basics.sizes[:, None] * basics.sizes * present + eye * (1 - present)
-
-    rest = scaled(None if weights is None else jnp.moveaxis(weights, 0, 2))
-    change = None
-    if grasps.inverse_root is not None:
-        inverse = jnp.einsum("nab...,ncb...->n...ac", grasps.inverse_root, grasps.inverse_root)
-        compliance = linalg.solve_positive(inverse, jnp.broadcast_to(jnp.eye(k, dtype=dtype), inverse.shape))
-        change = jnp.moveaxis(compliance, (0, -2, -1), (2, 0, 1))
-    change = scaled(change)
-    largest = fold(jnp.maximum, [jnp.max(jnp.abs(h), (0, 1, 2)) for h in (rest, change)])
+    dtype, weights, k = basics.sizes.dtype, grasps.options.effort_weights, len(basics.sizes)
+    rest = _scaled_weights(None if weights is None else weights[None], basics.sizes, grasps.present)
+    change = _scaled_weights(grasps.compliance, basics.sizes, grasps.present)
+    over = lambda h: jnp.max(jnp.abs(h), tuple(range(h.ndim - 1)))
+    largest = jnp.maximum(over(rest), over(change))
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     targets = jnp.concatenate([basics.load[:, None] - _asked(grasps) * basics.targets, basics.load[:, None]], 1)
     facets = contact_facets(cone_edges, k)
@@ -290,8 +300,8 @@ def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) 
         columns=basics.columns[:, :, :, None],
         rhs=targets,
         dropped=basics.dropped[:, None],
-        hub_hessian=(rest / unit)[:, :, :, None],
-        copy_hessian=(change / unit)[:, :, :, None],
+        hub_hessian=rest / unit,
+        copy_hessian=change / unit,
         guess=guess,
     )
     return problem, unit

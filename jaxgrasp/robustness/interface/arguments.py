@@ -95,8 +95,9 @@ class Options:
     """kappa of the central point that is asked for in place of the optimum."""
     cutoff: Float[Array, "*batch"] | None = None
     """The least margin that is of interest."""
-    effort_weights: Float[Array, "*batch contacts k k"] | None = None
-    """Q_0, blocks in contact frames; None is the identity."""
+    effort_weights: Float[Array, "..."] | None = None
+    """Q_0 as blocks (*batch, contacts, k, k) or full (*batch, k contacts, k contacts), contact frames; None is the
+    identity."""
 
 
 def optional_float(name: str, value: ArrayLike | None) -> jax.Array | None:
@@ -165,7 +166,9 @@ def trailing_shapes(data: GraspData, options: Options) -> tuple[GraspData, Optio
         cone_margin=None,
         actuation=actuation,
     )
-    option_shapes = replace(alike(options, ()), effort_weights=alike(options.effort_weights, (n, k, k)))
+    weights = options.effort_weights
+    weights = None if weights is None else _matrix_shape("effort_weights", weights, n, k)
+    option_shapes = replace(alike(options, ()), effort_weights=weights)
     return replace(shapes, cone_margin=_cone_margin_shape(data, options, shapes, option_shapes)), option_shapes
 
 
@@ -180,9 +183,6 @@ def lay_out(data: GraspData, options: Options) -> Arguments:
     _check_vertices(data)
     _check_jacobian(data)
     shapes, option_shapes = trailing_shapes(data, options)
-    if options.effort_weights is not None:
-        size = data.contacts.components
-        as_float("effort_weights", options.effort_weights, (data.contacts.n_c, size, size))
     data, options = moments_in_newtons(data, options)
     disturbances = data.disturbances
     batch = broadcast_batch(
@@ -249,7 +249,8 @@ def moments_in_newtons(data: GraspData, options: Options) -> tuple[GraspData, Op
     elif compliance is not None:
         compliance = turn(compliance, shape.shape, len(shape.shape) == 3)
     if weights is not None:
-        weights = turn(weights, weights.shape[-3:], True)
+        own = _matrix_shape("effort_weights", weights, *arms.shape[-1:], 4).shape
+        weights = turn(weights, own, len(own) == 3)
     if actuation is not None:
         jacobian = actuation.jacobian
         moved = jnp.concatenate([jacobian[..., :3, :], jacobian[..., 3:, :] * arms[..., None, None]], -2)
@@ -309,13 +310,7 @@ def _compliance_shape(data: GraspData) -> Any:
     if compliance is None:
         return None
     if not isinstance(compliance, Compliance):
-        array = as_float("compliance", compliance, ("rows", "columns"))
-        for shape in ((n, k, k), (k * n, k * n)):
-            if array.shape[-len(shape) :] == shape:
-                return Trailing(shape)
-        raise ValueError(
-            f"compliance: got shape {array.shape}, wanted (*batch, {n}, {k}, {k}) or (*batch, {k * n}, {k * n})"
-        )
+        return _matrix_shape("compliance", compliance, n, k)
     (vertices,) = data.disturbances.terms
     assert isinstance(vertices, Vertices)
     array, count = compliance.per_vertex, vertices.wrenches.shape[-2]
@@ -326,3 +321,16 @@ def _compliance_shape(data: GraspData) -> Any:
         f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, {k}, {k}) or "
         f"(*batch, {count}, {k * n}, {k * n}), one Q for each of the {count} wrenches"
     )
+
+
+def _matrix_shape(name: str, matrices: jax.Array, n: int, k: int) -> Trailing:
+    """The shape that Q or Q_0 has to end in: blocks of contacts, or all contacts together.
+
+    Raises:
+        ValueError: it ends in neither.
+    """
+    array = as_float(name, matrices, ("rows", "columns"))
+    for shape in ((n, k, k), (k * n, k * n)):
+        if array.shape[-len(shape) :] == shape:
+            return Trailing(shape)
+    raise ValueError(f"{name}: got shape {array.shape}, wanted (*batch, {n}, {k}, {k}) or (*batch, {k * n}, {k * n})")

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.robustness.auditing.pyramids import Evidence
+from jaxgrasp.robustness.auditing.multipliers import Evidence
 from jaxgrasp.robustness.auditing.rows import Rows as WorstRows
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.interface.solution import Solution
@@ -27,9 +27,18 @@ from jaxgrasp.solvers.block.margin import MarginProblem
 from jaxgrasp.solvers.interior_point import Iterate, Outcome, Settings
 from jaxgrasp.solvers.status import Status
 
+# A gap that did not close to the tolerance still counts as closed below this one.
+_ACCEPTED_GAP = {"float64": 1e-7, "float32": 1e-4}
 _MARGIN_SETTINGS = {
     "float64": Settings(
-        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=False, safeguard=0.0, patience=8
+        tolerance=1e-8,
+        max_iterations=60,
+        step_cap=1e-4,
+        mu_floor=0.0,
+        equal_steps=False,
+        safeguard=0.0,
+        patience=8,
+        accepted=_ACCEPTED_GAP["float64"],
     ),
     "float32": Settings(
         tolerance=5e-6, max_iterations=40, step_cap=1e-3, mu_floor=3e-8, equal_steps=True, safeguard=1e-3, patience=5
@@ -50,8 +59,6 @@ _EFFORT_SETTINGS = {
         gap_share=0.1,
     ),
 }
-# A gap that did not close to the tolerance still counts as closed below this one.
-_ACCEPTED_GAP = {"float64": 1e-7, "float32": 1e-4}
 # What a row of (22) may be missed by, in units of its largest force.
 _ACCEPTED_MISS = {"float64": 1e-8, "float32": 1e-5}
 

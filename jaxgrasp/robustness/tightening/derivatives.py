@@ -50,6 +50,7 @@ from jaxgrasp.robustness.worst_case import reach_adjoint
 from jaxgrasp.solvers.block.kkt import BlockProblem, total
 from jaxgrasp.solvers.block.sensitivity import solve_symmetric
 from jaxgrasp.solvers.interior_point import Iterate, reduce_rows
+from jaxgrasp.solvers.small_matrices import flatten
 
 
 class RowWeights(NamedTuple):
@@ -60,7 +61,7 @@ class RowWeights(NamedTuple):
     friction: (n, *lanes), of mu in C.
     columns: (6, k, n, *lanes), of the blocks of G, moments as in `Grasps`.
     wrench: (6, *lanes), of b.
-    weights: (n, k, k, *lanes), of Q_0; None where there is none.
+    weights: (n, k, k, *lanes) or (k n, k n, *lanes), of Q_0; None where there is none.
     margin: (*lanes), of the margin that is asked for; None where none is.
     """
 
@@ -209,8 +210,9 @@ def _central_adjoint(
         # lambda is data, and H = Q_0 / unit in the stationarity of f.
         asked = total(values * problem.groups[0].sigma * units.rows) / program.scale
         asked = asked if ct.margin is None else asked + ct.margin
-        bend = -0.5 / unit * (force[:, None] * move + move[:, None] * force)
-        bend = jnp.moveaxis(bend, 2, 0)
+        a, b = (flatten(force), flatten(move)) if grasps.full_weights else (force, move)
+        bend = -0.5 / unit * (a[:, None] * b + b[:, None] * a)
+        bend = bend if grasps.full_weights else jnp.moveaxis(bend, 2, 0)
         weights = bend if weights is None else bend + weights
     rows = RowWeights(
         cone=values[:-1],
@@ -229,13 +231,17 @@ def _central_adjoint(
 def _right_side(
     problem: BlockProblem, program: ScaledProgram, grasps: Grasps, forces: jax.Array, ct: Point, units: _Units
 ) -> tuple[tuple, jax.Array | None]:
-    """The cotangent c of the scaled (x, lambda, y, z), and what the effort's asks of Q_0 itself, (n, k, k, *lanes)."""
+    """The cotangent c of the scaled (x, lambda, y, z), and what the effort's asks of Q_0 itself, shaped like it."""
     (group,) = problem.groups
     pull = jnp.zeros_like(forces) if ct.forces is None else ct.forces
     weights = None
     if ct.effort is not None:
         pull = pull + ct.effort * apply_weights(forces, grasps.options.effort_weights)
-        weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
+        if grasps.full_weights:
+            flat = forces.reshape(-1, *forces.shape[2:])
+            weights = 0.5 * ct.effort * flat[:, None] * flat
+        else:
+            weights = 0.5 * ct.effort * forces[:, :, None] * forces[:, None]
     right_x = jnp.moveaxis(pull, 1, 0) * units.forces * grasps.present
     none = jnp.zeros_like(group.h)
     cone = none[:-1] if ct.cone_multipliers is None else jnp.moveaxis(ct.cone_multipliers, 1, 0)

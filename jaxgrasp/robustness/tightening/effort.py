@@ -12,7 +12,7 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.differentiable import Along
-from jaxgrasp.robustness.auditing.pyramids import Evidence
+from jaxgrasp.robustness.auditing.multipliers import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
@@ -46,8 +46,9 @@ def least_effort(
         margin: lambda (*batch,), >= 0; usually a share, say 75 %, of (21)'s.
         required_wrench: b (*batch, 6), N and N m; None is zero.
         compliance: Q, as in `largest_disturbance`.
-        effort_weights: Q_0 as blocks (*batch, n_c, 3, 3), contact frames, symmetric positive definite; None is the
-            identity. For soft contacts (*batch, n_c, 4, 4), as the compliance.
+        effort_weights: Q_0, contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3) or full
+            (*batch, 3 n_c, 3 n_c), for least joint torques `Actuation.joint_torque_weights`; None is the identity.
+            Full ones take dense linear algebra, blocks do not. For soft contacts 4 in place of 3, as the compliance.
         cone_edges: n_e.
         cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`.
         smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the

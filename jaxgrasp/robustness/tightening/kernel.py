@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from jaxgrasp.lanes.differentiable import Along, OfPyramids, Tree
 from jaxgrasp.robustness.auditing import Audited
-from jaxgrasp.robustness.auditing.pyramids import Evidence, Verdict, corrected, judge, spot
+from jaxgrasp.robustness.auditing.multipliers import Evidence
+from jaxgrasp.robustness.auditing.pyramids import Verdict, corrected, judge, spot
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.robustness.interface.solution import Solution

@@ -11,7 +11,7 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.differentiable import Along
-from jaxgrasp.robustness.auditing.pyramids import Evidence
+from jaxgrasp.robustness.auditing.multipliers import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float

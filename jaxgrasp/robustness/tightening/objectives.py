@@ -9,11 +9,13 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxgrasp.arrays import fold
+from jaxgrasp.contact.compliance import is_full
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.tightening.program import ScaledProgram, force_units
-from jaxgrasp.solvers.block.effort import EffortProblem, least_curvature
+from jaxgrasp.solvers.block.effort import EffortProblem, curvature_of
 from jaxgrasp.solvers.block.kkt import BlockProblem, Blocks, Rows
 from jaxgrasp.solvers.block.margin import MarginProblem
+from jaxgrasp.solvers.small_matrices import flatten
 
 _REFINEMENTS = {"float64": 0, "float32": 1}
 
@@ -45,8 +47,14 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
     eye = jnp.eye(program.columns.shape[1], dtype=dtype)[..., None, None]
     # H = D Q_0 D = root'root with root = R D, Q_0 = R'R and the units D of forces.
     root = eye if grasps.weight_roots is None else grasps.weight_roots
-    root = root * force_units(program.tangential, program.normal, len(program.columns[0])) * blocks.present
-    largest = lax.stop_gradient(fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))))
+    units = force_units(program.tangential, program.normal, program.columns.shape[1])
+    if root.ndim < blocks.columns.ndim:
+        root = root * flatten(units * blocks.present)
+        largest = fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))
+    else:
+        root = root * units * blocks.present
+        largest = fold(jnp.maximum, fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root))))
+    largest = lax.stop_gradient(largest)
     largest = jnp.where(largest > 0, largest, 1)
 
     def with_margin(group: Blocks, root: jax.Array) -> Blocks:
@@ -64,14 +72,18 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
         program.radius,
         _REFINEMENTS[dtype.name],
         guess,
-        tuple(least_curvature(g.root) for g in groups),
+        tuple(curvature_of(g) for g in groups),
     )
     return ScaledEffort(problem, margin, largest)
 
 
 def apply_weights(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """Q_0 f of forces (n, k, *lanes); None for the weights is Q_0 = I."""
-    return forces if weights is None else jnp.einsum("nab...,nb...->na...", weights, forces)
+    """Q_0 f of forces (n, k, *lanes), with blocks or a full Q_0; None for the weights is Q_0 = I."""
+    if weights is None:
+        return forces
+    if is_full(weights, len(forces)):
+        return jnp.einsum("pq...,q...->p...", weights, forces.reshape(-1, *forces.shape[2:])).reshape(forces.shape)
+    return jnp.einsum("nab...,nb...->na...", weights, forces)
 
 
 def compute_effort(forces: jax.Array, weights: jax.Array | None) -> jax.Array:

@@ -315,7 +315,7 @@ def _scale_equalities(
 
 def prepare(grasps: Grasps, cone_edges: int) -> tuple[Grasps, ScaledProgram]:
     """Scale the programs; beside them, all of the grasps but the disturbance set is needed to solve them."""
-    return replace(grasps, terms=(), extents=()), scale_program(grasps, cone_edges)
+    return replace(grasps, terms=(), extents=(), compliance=None), scale_program(grasps, cone_edges)
 
 
 def actuated_values(

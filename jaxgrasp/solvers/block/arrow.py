@@ -1,23 +1,24 @@
 """A quadratic program whose copies of small blocks meet in one of them: the form of (11).
 
-    min 1/2 x_0' H_0 x_0 + sum_j 1/2 (x_j - x_0)' H (x_j - x_0)   over x_0, x_1 .. x_J, blocks of k unknowns each, with
+    min 1/2 x_0' H_0 x_0 + sum_j 1/2 (x_j - x_0)' H_j (x_j - x_0)   over x_0, x_1 .. x_J, blocks of k each, with
     A x_ji <= h   and   sum_i E_i x_ji = b_j.
 
 The Newton matrix is an arrow: given x_0, the hub, the copies have nothing to do with each other. With the weights W of
-the rows, P_j = A'W_j A + H and P_0 = A'W_0 A + H_0 + J H, a step solves
+the rows, P_j = A'W_j A + H_j and P_0 = A'W_0 A + H_0 + sum_j H_j, a step solves
 
-    P_j dx_j - H dx_0 + E'dy_j = r_j,    E dx_j = q_j            for every copy j,
-    P_0 dx_0 - sum_j H dx_j + E'dy_0 = r_0,    E dx_0 = q_0.
+    P_j dx_j - H_j dx_0 + E'dy_j = r_j,    E dx_j = q_j            for every copy j,
+    P_0 dx_0 - sum_j H_j dx_j + E'dy_0 = r_0,    E dx_0 = q_0.
 
-The blocks of the copies are eliminated, then their equalities, with F_j = P_j^-1 H, a Cholesky factor of
+The blocks of the copies are eliminated, then their equalities, with F_j = P_j^-1 H_j, a Cholesky factor of
 E P_j^-1 E' = L_j L_j' and G_j = L_j^-1 E F_j:
 
     dx_j = P_j^-1 (r_j - E'dy_j) + F_j dx_0,    L_j'dy_j = L_j^-1 (E P_j^-1 r_j - q_j) + G_j dx_0,
 
-    (P_0 - sum_j (H F_j - G_j'G_j)) dx_0 + E'dy_0 = r_0 + sum_j (H P_j^-1 r_j - G_j'L_j^-1 (E P_j^-1 r_j - q_j)).
+    (P_0 - sum_j (H_j F_j - G_j'G_j)) dx_0 + E'dy_0 = r_0 + sum_j (H_j P_j^-1 r_j - G_j'L_j^-1 (E P_j^-1 r_j - q_j)).
 
 The last system, of k n unknowns and the equalities of the hub, is solved by inverse Cholesky factors. A step costs
-O(J (n + n^2) + n^3); a dense factorisation would cost O(J^3 n^3).
+O(J (n + n^2) + n^3); a dense factorisation would cost O(J^3 n^3). Where H_j ties the blocks together P_j is dense, too,
+and a step costs O(J n^3). H_0 may be full at no cost, since the hub's matrix is.
 
 Callers scale: |x|_inf <= 1 at admissible points, rows of E orthonormal or zero, entries of H at most 1.
 """
@@ -30,17 +31,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.lanes.fence import fenced, repeat
+from jaxgrasp.lanes.fence import each, fenced, repeat
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.small_matrices import (
     SmallFactor,
+    block_diagonal,
+    flatten,
     inverse_cholesky,
+    matmul,
     matvec,
     matvec_transposed,
     small_cholesky,
     solve_small,
     spread_over,
     sum_over_blocks,
+    unflatten,
 )
 
 
@@ -58,8 +63,9 @@ class ArrowRecord(NamedTuple):
 class _Factors(NamedTuple):
     """The reduced Newton system, in the letters of the module's docstring."""
 
-    blocks: SmallFactor  # Cholesky factors of the k x k blocks of P_j, (n, J, *lanes)
-    follow: jax.Array  # (k, k, n, J, *lanes), F_j
+    # Cholesky factors of the blocks of P_j, (n, J, *lanes), or one of a dense P_j, (k n, k n, J, *lanes), inverted.
+    copies: SmallFactor | jax.Array
+    follow: jax.Array  # F_j, like H_j
     roots: jax.Array  # (eq, eq, J, *lanes), L_j^-1
     reach: jax.Array  # (eq, k, n, J, *lanes), G_j
     hub: jax.Array  # (k n, k n, *lanes), K, the inverse Cholesky factor of the matrix of dx_0
@@ -84,9 +90,9 @@ class ArrowProblem:
     dropped: jax.Array
     """A mask of the equality rows, (eq, 1, *lanes): 1 for rows that are zero, else 0."""
     hub_hessian: jax.Array
-    """The blocks of H_0, (k, k, n, 1, *lanes)."""
+    """H_0: its blocks, (k, k, n, 1, *lanes), or a full matrix, (k n, k n, 1, *lanes), block by block."""
     copy_hessian: jax.Array
-    """The blocks of H, (k, k, n, 1, *lanes)."""
+    """H_j: blocks, (k, k, n, J or 1, *lanes), or full matrices, (k n, k n, J or 1, *lanes); 1 where all are one."""
     guess: jax.Array
     """A point to start from, (k, n, J + 1, *lanes): inside the rows, if possible."""
 
@@ -127,16 +133,16 @@ class ArrowProblem:
 
     def gradient(self, x: jax.Array) -> jax.Array:
         """Compute the gradient of the objective at x, shaped like x."""
-        moved = matvec(self.copy_hessian, x[:, :, :-1] - x[:, :, -1:])
-        hub = matvec(self.hub_hessian, x[:, :, -1:]) - _sum_copies(moved)
+        moved = _times(self.copy_hessian, x[:, :, :-1] - x[:, :, -1:])
+        hub = _times(self.hub_hessian, x[:, :, -1:]) - _sum_copies(moved)
         return jnp.concatenate([moved, hub], 2)
 
     def objective(self, x: jax.Array) -> jax.Array:
         """Compute the objective at x, (*lanes)."""
         moved = x[:, :, :-1] - x[:, :, -1:]
         return 0.5 * (
-            _total(moved * matvec(self.copy_hessian, moved))
-            + _total(x[:, :, -1:] * matvec(self.hub_hessian, x[:, :, -1:]))
+            _total(moved * _times(self.copy_hessian, moved))
+            + _total(x[:, :, -1:] * _times(self.hub_hessian, x[:, :, -1:]))
         )
 
     def start(self) -> Iterate:
@@ -154,7 +160,10 @@ class ArrowProblem:
     def factor(self, weights: jax.Array) -> _Factors:
         """Factor the Newton system: eliminate the copies' blocks, their equalities, then x_0."""
         eq, size = self.columns.shape[0], self.columns.shape[1] * self.columns.shape[2]
-        factors, follow, matrix, across, hub = fenced(self._eliminate_copies)(weights)
+        if self.copy_hessian.ndim == self.guess.ndim:
+            factors, follow, matrix, across, hub = self._eliminate_coupled_copies(weights)
+        else:
+            factors, follow, matrix, across, hub = fenced(self._eliminate_copies)(weights)
 
         # Equalities of the copies: G_j = L_j^-1 E F_j, and the sum of G_j'G_j for the hub.
         eye = jnp.eye(eq, dtype=weights.dtype).reshape(eq, eq, *[1] * (self.rhs.ndim - 1))
@@ -165,8 +174,10 @@ class ArrowProblem:
             reach = jnp.stack([fold(jnp.add, root[:, None, None] * across) for root in roots])
             flat = jnp.swapaxes(reach, 1, 2).reshape(eq, size, -1, *self.lanes)
             whole = jnp.einsum("epj...,eqj...->pq...", flat, flat)
-            blocks = jnp.einsum("abi...,ik->iakb...", hub, jnp.eye(hub.shape[2], dtype=hub.dtype))
-            return reach, whole + blocks.reshape(size, size, *self.lanes)
+            whole = whole + (hub if hub.ndim == whole.ndim else block_diagonal(hub))
+            if self.hub_hessian.ndim == self.guess.ndim:
+                whole = whole + self.hub_hessian[:, :, 0]
+            return reach, whole
 
         reach, whole = couple(roots, across, hub)
 
@@ -192,22 +203,50 @@ class ArrowProblem:
         )
 
     def _eliminate_copies(self, weights: jax.Array) -> tuple:
-        """Compute factors of P_j, F_j, E P_j^-1 E' and E F_j of the copies, and the blocks of P_0 - sum_j H F_j."""
+        """Compute factors of P_j, F_j, E P_j^-1 E' and E F_j of the copies, and P_0 - sum_j H_j F_j without a full H_0.
+
+        The last one comes in blocks.
+        """
         eq, k = self.columns.shape[:2]
-        pairs = [(a, b) for a in range(k) for b in range(a + 1)]
-        grams = [
-            fold(jnp.add, spread_over(self.patterns[:, a] * self.patterns[:, b], weights) * weights) for a, b in pairs
-        ]
+        pairs = _pairs(k)
+        grams = self._grams(weights)
         factors = small_cholesky([g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
         follow = jnp.stack([solve_small(factors, self.copy_hessian[:, b]) for b in range(k)], 1)
         solved = jnp.stack([solve_small(factors, self.columns[r]) for r in range(eq)])
         matrix = jnp.stack([sum_over_blocks(self.columns * solved[r]) for r in range(eq)])
         across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
-        full = [grams[pairs.index((max(a, b), min(a, b)))] for a in range(k) for b in range(k)]
-        hub = jnp.stack(full).reshape(k, k, *full[0].shape)[:, :, :, -1:] + self.hub_hessian
-        # H - H P_j^-1 H of every copy, whose sum over the copies joins H_0 + A'W_0 A.
+        hub = _symmetric(grams)[:, :, :, -1:]
+        if self.hub_hessian.ndim > self.guess.ndim:
+            hub = hub + self.hub_hessian
+        # H_j - H_j P_j^-1 H_j of every copy, whose sum over the copies joins H_0 + A'W_0 A.
         remainder = self.copy_hessian - fold(jnp.add, jnp.moveaxis(self.copy_hessian[:, :, None] * follow[None], 1, 0))
         return factors, follow, matrix, across, (hub + _sum_copies(remainder, 3))[:, :, :, 0]
+
+    def _eliminate_coupled_copies(self, weights: jax.Array) -> tuple:
+        """Do what `_eliminate_copies` does where H_j are full matrices; so is then what is left of the hub."""
+        blocks = fenced(lambda weights: _symmetric(self._grams(weights)))(weights)
+        roots = inverse_cholesky(block_diagonal(blocks[:, :, :, :-1]) + self.copy_hessian)
+        pulled = matmul(roots, self.copy_hessian)
+        follow = matmul(jnp.swapaxes(roots, 0, 1), pulled)
+
+        @fenced
+        def reduce(roots: jax.Array, pulled: jax.Array) -> tuple:
+            turned = each(lambda column: matvec(roots, column), jax.vmap(flatten)(self.columns))
+            matrix = each(lambda row: fold(jnp.add, jnp.moveaxis(turned * row, 1, 0)), turned)
+            across = each(lambda row: matvec_transposed(pulled, row), turned)
+            return matrix, jax.vmap(lambda x: unflatten(x, self.columns.shape[1]))(across)
+
+        matrix, across = reduce(roots, pulled)
+        remainder = self.copy_hessian - matmul(jnp.swapaxes(pulled, 0, 1), pulled)
+        hub = blocks[:, :, :, -1]
+        if self.hub_hessian.ndim > self.guess.ndim:
+            hub = hub + self.hub_hessian[:, :, :, 0]
+        return roots, follow, matrix, across, block_diagonal(hub) + jnp.sum(remainder, 2)
+
+    def _grams(self, weights: jax.Array) -> list[jax.Array]:
+        """Compute the entries `_pairs` of the blocks of A'W A, (n, J + 1, *lanes) each."""
+        squares = [self.patterns[:, a] * self.patterns[:, b] for a, b in _pairs(self.patterns.shape[1])]
+        return [fold(jnp.add, spread_over(square, weights) * weights) for square in squares]
 
     def solve(self, factors: _Factors, residuals: Residuals, shift: jax.Array) -> tuple:
         """Solve the Newton system with dz = shift + weights * A dx for the directions (dx, dy, A dx)."""
@@ -216,12 +255,12 @@ class ArrowProblem:
         @fenced
         def newton(rhs: jax.Array, rhs_y: jax.Array) -> tuple:
             # Copies, while x_0 stays: P_j^-1 r_j and L_j^-1 (E P_j^-1 r_j - q_j).
-            first = solve_small(factors.blocks, rhs[:, :, :-1])
+            first = _solve_copies(factors.copies, rhs[:, :, :-1])
             root_y = matvec(factors.roots, self.equality(first) - rhs_y[:, :-1])
 
             # The hub: its right-hand side, then dy_0 and dx_0.
             push = fold(jnp.add, factors.reach * root_y[:, None, None])
-            right = rhs[:, :, -1:] + _sum_copies(matvec(self.copy_hessian, first) - push)
+            right = rhs[:, :, -1:] + _sum_copies(_times(self.copy_hessian, first) - push)
             flat = jnp.swapaxes(right[:, :, 0], 0, 1).reshape(k * n, *self.lanes)
             root_right = matvec(factors.hub, flat)
             hub_y = matvec(factors.hub_root, matvec(factors.hub_columns, root_right) - rhs_y[:, -1])
@@ -231,7 +270,7 @@ class ArrowProblem:
 
             # Back to the copies: dy_j and dx_j.
             copies_y = matvec_transposed(factors.roots, root_y + sum_over_blocks(factors.reach * hub))
-            copies = first + matvec(factors.follow, hub) - solve_small(factors.blocks, self.pull_back(copies_y))
+            copies = first + _times(factors.follow, hub) - _solve_copies(factors.copies, self.pull_back(copies_y))
             return jnp.concatenate([copies, hub], 2), jnp.concatenate([copies_y, hub_y[:, None]], 1)
 
         def improve(_: jax.Array, state: tuple) -> tuple:
@@ -302,6 +341,32 @@ def build_rows(facets: np.ndarray, dtype: jnp.dtype, axes: int) -> tuple[jax.Arr
     bound = np.array([[0.0, 0.0, -1.0, 0.0][: facets.shape[1]]])
     rows = literal(np.concatenate([facets, bound]), dtype)
     return rows, literal(np.array([0.0] * len(facets) + [1.0]), dtype).reshape(-1, *[1] * axes)
+
+
+def _pairs(k: int) -> list[tuple[int, int]]:
+    """The entries of a symmetric k x k matrix that `small_cholesky` takes."""
+    return [(a, b) for a in range(k) for b in range(a + 1)]
+
+
+def _symmetric(entries: list[jax.Array]) -> jax.Array:
+    """Build symmetric blocks (k, k, ...) of their entries `_pairs`."""
+    k = round((2 * len(entries)) ** 0.5 - 0.5)
+    full = [entries[_pairs(k).index((max(a, b), min(a, b)))] for a in range(k) for b in range(k)]
+    return jnp.stack(full).reshape(k, k, *full[0].shape)
+
+
+def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
+    """Multiply blocks, (k, k, n, ...), or full matrices, (k n, k n, ...), by x (k, n, ...)."""
+    if matrix.ndim > x.ndim:
+        return matvec(matrix, x)
+    return unflatten(matvec(matrix, flatten(x)), len(x))
+
+
+def _solve_copies(factors: list[jax.Array] | jax.Array, rhs: jax.Array) -> jax.Array:
+    """Compute P_j^-1 rhs, (k, n, J, *lanes), with factors of blocks or of dense matrices."""
+    if isinstance(factors, SmallFactor):
+        return solve_small(factors, rhs)
+    return unflatten(matvec_transposed(factors, matvec(factors, flatten(rhs))), len(rhs))
 
 
 def _sum_copies(x: jax.Array, axis: int = 2) -> jax.Array:

@@ -1,4 +1,4 @@
-"""The program min 1/2 sum x_i' H_i x_i over blocks, lambda held: the form of (22)."""
+"""The program min 1/2 sum x_i' H_i x_i over blocks, or 1/2 x'H x over all of them, lambda held: the form of (22)."""
 
 from dataclasses import dataclass
 
@@ -9,6 +9,7 @@ from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import fenced, repeat
 from jaxgrasp.solvers.block.kkt import (
     BlockProblem,
+    Blocks,
     Factors,
     Record,
     Rows,
@@ -19,6 +20,7 @@ from jaxgrasp.solvers.block.kkt import (
     total,
 )
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
+from jaxgrasp.solvers.small_matrices import flatten, matvec, orthonormalise
 
 
 @jax.tree_util.register_dataclass
@@ -30,7 +32,8 @@ class EffortProblem(BlockProblem):
     the blocks' bounds are |x|_inf <= 1.
 
     guess: a point to start from that nearly meets E x = b, well inside the rows if possible.
-    curvature: like x, c >= 0 with H - diag(c) positive semidefinite, see `least_curvature`.
+    curvature: like x, c >= 0 with H - diag(c) positive semidefinite, or K with K'K = H^-1 of a group whose blocks H
+        ties together, see `curvature_of`.
     """
 
     guess: Rows = ()
@@ -108,8 +111,8 @@ class EffortProblem(BlockProblem):
         near = 1e-9 if self.rhs.dtype == jnp.float64 else 2e-6
         upper = jnp.where(violation <= near, value(x) + 2 * charge, jnp.inf)
         sides = fold(jnp.add, [total(g.h * z) for g, z in zip(self.groups, iterate.z, strict=True)])
-        losses = map(_largest_loss, self.curvature, iterate.x, residuals.dual)
-        lower = -value(iterate.x) - sides - fold(jnp.add, iterate.y * self.rhs) - fold(jnp.add, map(total, losses))
+        losses = map(_largest_loss, self.groups, self.curvature, iterate.x, residuals.dual)
+        lower = -value(iterate.x) - sides - fold(jnp.add, iterate.y * self.rhs) - fold(jnp.add, losses)
         falls, rises = upper < record.upper, lower > record.lower
         return Record(
             lower=jnp.where(rises, lower, record.lower),
@@ -120,22 +123,30 @@ class EffortProblem(BlockProblem):
         )
 
 
-def least_curvature(root: jax.Array) -> jax.Array:
+def curvature_of(group: Blocks) -> jax.Array:
     """Find a c >= 0, (k, n, *lanes), with H - diag(c) diagonally dominant: for a diagonal H its diagonal.
 
-    Args:
-        root: (k, k, n, *lanes), H = root' root.
+    Where H ties the blocks together: K, (k n, k n, *lanes), with K'K = H^-1, any where a block is absent.
     """
+    root = group.root
+    if group.coupled:
+        absent = flatten(jnp.broadcast_to(1 - group.present, group.columns.shape[1:]))
+        eye = jnp.eye(len(root), dtype=root.dtype).reshape(*root.shape[:2], *[1] * (root.ndim - 2))
+        return jnp.swapaxes(orthonormalise(root + eye * absent), 0, 1)
     matrix = jnp.stack([fold(jnp.add, root * column[:, None]) for column in jnp.moveaxis(root, 1, 0)])
     off_diagonal = lambda a, row: [jnp.abs(entry) for b, entry in enumerate(row) if b != a]
     return jnp.maximum(jnp.stack([row[a] - sum(off_diagonal(a, row)) for a, row in enumerate(matrix)]), 0)
 
 
-def _largest_loss(curvature: jax.Array, x: jax.Array, r: jax.Array) -> jax.Array:
-    """Bound -r u - c/2 (u - x)^2 from above over |u| <= 1, for every unknown: by r^2/(2 c) - r x or by |r|.
+def _largest_loss(group: Blocks, curvature: jax.Array, x: jax.Array, r: jax.Array) -> jax.Array:
+    """Bound -r'u - 1/2 (u - x)'H (u - x) from above over |u| <= 1, (*lanes), from the group's curvature.
 
-    Where the objective is curved, u is near x, and the sign of r x counts: in float32 this bound is far tighter.
+    For every unknown by r^2/(2 c) - r x or by |r|, or for all at once by 1/2 r'H^-1 r - r'x or by |r|_1. Where the
+    objective is curved, u is near x, and the sign of r x counts: in float32 this bound is far tighter.
     """
+    if group.coupled:
+        turned = matvec(curvature, flatten(r))
+        return jnp.minimum(0.5 * fold(jnp.add, turned * turned) - total(r * x), total(jnp.abs(r)))
     curved = curvature > 0
     near = 0.5 * r * r / jnp.where(curved, curvature, 1) - r * x
-    return jnp.where(curved, jnp.minimum(near, jnp.abs(r)), jnp.abs(r))
+    return total(jnp.where(curved, jnp.minimum(near, jnp.abs(r)), jnp.abs(r)))

@@ -25,6 +25,9 @@ others. Forming A'W A would square the condition of W^1/2 A, and kappa as a diff
 W^1/2 [A, sigma] (with a root of H below A) are made orthogonal instead: the coefficients are L, with L L' = P, and
 theta = L^-1 p, and the square of what remains of the last column is kappa.
 
+Where H ties the blocks of a group together (`effort` alone), the roots L_i' of their A'W A stand above the root of H,
+and the columns of all of it are made orthogonal: P is then dense, and its cost cubic in the number of blocks.
+
 Both programs certify their results at every step. Any x with E x = b attains lambda_lo = min (h - A x) / sigma. Any
 z >= 0 scaled to sum sigma z = 1 proves lambda* <= h'z + b'y + radius |A'z + E'y|_1; radius bounds |x|_inf at the
 optimum.
@@ -44,13 +47,16 @@ import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import each, fenced
+from jaxgrasp.solvers.block.factors import BlockFactor, Factor, couple, solve_lower, solve_upper
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.small_matrices import (
+    flatten,
     inverse_cholesky,
+    matvec,
     matvec_transposed,
     spread_over,
     substitute_down,
-    substitute_up,
+    unflatten,
 )
 
 Rows = tuple[jax.Array, ...]
@@ -65,7 +71,8 @@ class Blocks(NamedTuple):
     sigma: the column of lambda, (m, n, *lanes), >= 0; zero where a block is absent.
     h: the right-hand sides, (m, n, *lanes); one where a block is absent.
     present: a mask of the blocks, (n, *lanes): 1 or 0.
-    hessian_root: a root of H_i (H_i = root' root), (k, k, n, *lanes), for `EffortProblem`; None where H = 0.
+    hessian_root: a root of H_i (H_i = root' root), (k, k, n, *lanes), for `EffortProblem`, or of an H that ties the
+        blocks together, (k n, k n, *lanes) block by block, zero where a block is absent; None where H = 0.
     start: the unknowns of every block at the start, (k,).
     """
 
@@ -88,6 +95,11 @@ class Blocks(NamedTuple):
         assert self.hessian_root is not None
         return self.hessian_root
 
+    @property
+    def coupled(self) -> bool:
+        """Whether H ties the blocks together."""
+        return self.hessian_root is not None and self.hessian_root.ndim < self.columns.ndim
+
 
 class Record(NamedTuple):
     """The best certified bounds so far and the points that give them: x the attained one, (y, z) the proven one."""
@@ -97,16 +109,6 @@ class Record(NamedTuple):
     x: Rows
     y: jax.Array
     z: Rows
-
-
-class _BlockFactor(NamedTuple):
-    """The Cholesky factor L of P, and solutions with it; lists run over the k unknowns of a block."""
-
-    below: list[jax.Array]  # L10, L20, L21 .., each (n, *lanes)
-    inverse: list[jax.Array]  # 1 / diag(L), each (n, *lanes)
-    columns: list[jax.Array]  # L^-1 E', each (eq, n, *lanes)
-    theta: list[jax.Array]  # L^-1 p, each (n, *lanes)
-    kappa: jax.Array | None  # (n, *lanes), this block's part of kappa
 
 
 class _Border(NamedTuple):
@@ -119,7 +121,7 @@ class _Border(NamedTuple):
 class Factors(NamedTuple):
     """The reduced Newton system; `border` is None where lambda is held."""
 
-    blocks: list[_BlockFactor]
+    blocks: list[Factor]
     root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of E P^-1 E' + v v'/kappa
     weights: Rows
     border: _Border | None
@@ -137,6 +139,8 @@ def adjoint_rows(group: Blocks, z: jax.Array) -> jax.Array:
 
 def apply_hessian(group: Blocks, x: jax.Array) -> jax.Array:
     """Compute H x = root' (root x), (k, n, *lanes)."""
+    if group.coupled:
+        return unflatten(matvec_transposed(group.root, matvec(group.root, flatten(x))), len(x))
     product = fold(jnp.add, jnp.moveaxis(group.root * x, 1, 0))
     return matvec_transposed(group.root, product)
 
@@ -229,11 +233,11 @@ class BlockProblem(ABC):
     def factor(self, weights: Rows) -> Factors:
         """Factor the Newton system for weights z/s: eliminate the blocks, then lambda."""
         # Blocks: L L' = P, with theta = L^-1 p and L^-1 E'.
-        blocks = [self._factor_block(g, w) for g, w in zip(self.groups, weights, strict=True)]
+        blocks = [self._factor_group(g, w) for g, w in zip(self.groups, weights, strict=True)]
 
         # Equality rows and lambda: E P^-1 E', v = -E P^-1 p and 1 / kappa.
         @fenced
-        def reduce(blocks: list[_BlockFactor]) -> tuple:
+        def reduce(blocks: list[Factor]) -> tuple:
             columns = [f.columns for f in blocks]
 
             def row(r: jax.Array) -> jax.Array:
@@ -257,7 +261,12 @@ class BlockProblem(ABC):
         border = _Border(inverse, v) if self.bordered else None
         return Factors(blocks, inverse_cholesky(complete(matrix, v, inverse)), weights, border)
 
-    def _factor_block(self, g: Blocks, weights: jax.Array) -> _BlockFactor:
+    def _factor_group(self, g: Blocks, weights: jax.Array) -> Factor:
+        if not g.coupled:
+            return self._factor_block(g, weights)
+        return couple(self._factor_block(g._replace(hessian_root=None), weights), g.root, g.columns)
+
+    def _factor_block(self, g: Blocks, weights: jax.Array) -> BlockFactor:
         """Make the columns of [A, sigma] orthogonal in the inner product of W, by modified Gram-Schmidt.
 
         P = A'W A itself would square the condition, too much for float32.
@@ -296,7 +305,7 @@ class BlockProblem(ABC):
         # The remaining column is sigma's, and its square is kappa.
         kappa = fenced(lambda w, c: fold(jnp.add, w * c * c))(weights, columns[0]) if self.bordered else None
         reduced = fenced(lambda below, inverse: substitute_down(below, inverse, [g.columns[:, a] for a in range(k)]))
-        return _BlockFactor(below, inverse, reduced(below, inverse), theta, kappa)
+        return BlockFactor(below, inverse, reduced(below, inverse), theta, kappa)
 
     def newton(self, factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
         """Solve the system of this module's docstring for (dx, dlambda, dy).
@@ -307,11 +316,11 @@ class BlockProblem(ABC):
         # Eliminate the blocks: L^-1 r_x, E P^-1 r_x - r_y and r_lambda - p'P^-1 r_x.
         @fenced
         def eliminate(factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
-            reduced = [substitute_down(f.below, f.inverse, list(r)) for f, r in zip(factors.blocks, rhs_x, strict=True)]
+            reduced = [solve_lower(f, r) for f, r in zip(factors.blocks, rhs_x, strict=True)]
             pairs = [
                 (c, t, a)
                 for f, r in zip(factors.blocks, reduced, strict=True)
-                for c, t, a in zip(f.columns, f.theta or f.inverse, r, strict=True)
+                for c, t, a in zip(f.columns, f.theta or f.columns, r, strict=True)
             ]
             right = fold(jnp.add, [_over_blocks(c * a, 1) for c, _, a in pairs]) - rhs_y
             if rhs_lambda is None:
@@ -337,11 +346,11 @@ class BlockProblem(ABC):
         @fenced
         def substitute(factors: Factors, reduced: list, dy: jax.Array, dlambda: jax.Array | None) -> Rows:
             out = []
-            for f, r in zip(factors.blocks, reduced, strict=True):
+            for g, f, r in zip(self.groups, factors.blocks, reduced, strict=True):
                 right = [a - fold(jnp.add, c * dy[:, None]) for c, a in zip(f.columns, r, strict=True)]
                 if dlambda is not None:
                     right = [a - t * dlambda for a, t in zip(right, f.theta, strict=True)]
-                out.append(jnp.stack(substitute_up(f.below, f.inverse, right)))
+                out.append(solve_upper(f, right, g.patterns.shape[1]))
             return tuple(out)
 
         reduced, right, pull = eliminate(factors, rhs_x, rhs_lambda, rhs_y)
