@@ -120,7 +120,7 @@ class Actuation:
 
         Returns:
             J J' + lever^2 I, (*batch, 3 n_c, 3 n_c), contact by contact in contact frames, for `effort_weights`; of soft
-            contacts (*batch, 4 n_c, 4 n_c), where a moment counts as a torque at the lever per metre.
+            contacts (*batch, 4 n_c, 4 n_c).
 
         Raises:
             ValueError: shapes that do not fit.

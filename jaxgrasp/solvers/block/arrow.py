@@ -362,7 +362,7 @@ def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
     return unflatten(matvec(matrix, flatten(x)), len(x))
 
 
-def _solve_copies(factors: list[jax.Array] | jax.Array, rhs: jax.Array) -> jax.Array:
+def _solve_copies(factors: SmallFactor | jax.Array, rhs: jax.Array) -> jax.Array:
     """Compute P_j^-1 rhs, (k, n, J, *lanes), with factors of blocks or of dense matrices."""
     if isinstance(factors, SmallFactor):
         return solve_small(factors, rhs)
