@@ -119,8 +119,8 @@ class Actuation:
                 float32, a hundredth).
 
         Returns:
-            J J' + lever^2 I, (*batch, 3 n_c, 3 n_c), contact by contact in contact frames, for `effort_weights`; of soft
-            contacts (*batch, 4 n_c, 4 n_c).
+            J J' + lever^2 I, (*batch, 3 n_c, 3 n_c), contact by contact in contact frames, for `effort_weights`; of
+            soft contacts (*batch, 4 n_c, 4 n_c).
 
         Raises:
             ValueError: shapes that do not fit.

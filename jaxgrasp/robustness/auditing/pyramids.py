@@ -211,15 +211,16 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
         return pushes, jnp.sqrt(inner(f, f)), all_last((forces == 0) | problem.transmits)
 
     @once
-    def moments(problem: Problem, pushes: jax.Array, forces: jax.Array) -> list[jax.Array]:
+    def moments(problem: Problem, pushes: jax.Array, forces: jax.Array | None) -> list[jax.Array]:
         turns = cross(parts_of(problem.positions), parts_of(pushes))
-        if problem.arms is not None:
+        if problem.arms is not None and forces is not None:
             twist = jnp.where(problem.transmits[..., 3], problem.arms * forces[..., 3], 0)
             turns = [x + n * twist for x, n in zip(turns, parts_of(problem.frames[..., 2]), strict=True)]
         return [jnp.where(problem.present, x, 0) for x in turns]
 
     pushes, sizes, possible = turned(problem, forces)
-    given = [sum_last(part) for part in parts_of(pushes) + moments(problem, pushes, forces)]
+    soft = None if problem.arms is None else forces
+    given = [sum_last(part) for part in parts_of(pushes) + moments(problem, pushes, soft)]
     in_newtons = lambda parts: parts[:3] + [moment / problem.size for moment in parts[3:]]
     load = in_newtons(parts_of(problem.wrench))
     wanted = load if wrench is None else in_newtons(parts_of(wrench))

@@ -249,7 +249,7 @@ def moments_in_newtons(data: GraspData, options: Options) -> tuple[GraspData, Op
     elif compliance is not None:
         compliance = turn(compliance, shape.shape, len(shape.shape) == 3)
     if weights is not None:
-        own = _matrix_shape("effort_weights", weights, *arms.shape[-1:], 4).shape
+        own = _matrix_shape("effort_weights", weights, data.contacts.n_c, 4).shape
         weights = turn(weights, own, len(own) == 3)
     if actuation is not None:
         jacobian = actuation.jacobian
