@@ -402,9 +402,9 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="equation"):
         jg.specified_disturbances(contacts, forces, "10")
     with pytest.raises(ValueError, match="compliance"):
-        jg.least_total_effort(contacts, forces, compliance=jnp.eye(9))
+        jg.least_total_effort(contacts, forces, compliance=jnp.eye(8))
     with pytest.raises(ValueError, match="effort_weights: got shape"):
-        jg.least_total_effort(contacts, forces, effort_weights=jnp.eye(9))
+        jg.least_total_effort(contacts, forces, effort_weights=jnp.eye(8))
 
 
 @pytest.mark.thorough
