@@ -287,7 +287,7 @@ class Chain(Audited):
             # Nothing ties the directions together but the smallest of their margins.
             sliding = problem.friction * problem.max_force
             sizes = jnp.stack([sliding, sliding, problem.max_force, sliding][: point.x.shape[1]], 1)
-            sizes *= jnp.swapaxes(problem.transmits, 1, 2)
+            sizes *= jnp.swapaxes(problem.transmits, 1, 2).astype(sizes.dtype)
             forces = jnp.moveaxis(point.x[..., :-1] * sizes[..., None], (3, 2), (1, 2))
             wrenches = disturbed_wrenches(problem, directions)
             looked_at = jnp.isfinite(directions) & (directions > 0)
