@@ -47,6 +47,13 @@ class Grasp:
     cone_edges: int = 8
     cone_margin: float | np.ndarray = 0.0
     """d, newtons: for all rows, (n_c, 1), or (n_c, n_e)."""
+    torsional: np.ndarray | None = None
+    """(n_c,), metres; None for hard contacts. Moments m about the normals are a fourth component, m mu / gamma, N,
+    which compliances and weights weigh."""
+
+    @property
+    def components(self) -> int:
+        return 3 if self.torsional is None else 4
 
     @cached_property
     def row_scale(self) -> np.ndarray:
@@ -59,22 +66,29 @@ class Grasp:
         """Equation (5): G (6, 3 n_c), contact i contributes [R_i; p_i x R_i], its normal alone without friction."""
         frames = self.frames * np.stack([self.friction > 0] * 2 + [self.friction >= 0], axis=-1)[:, None]
         moments = np.cross(self.positions[:, :, None], frames, axis=1)
-        return np.concatenate([frames, moments], axis=1).transpose(1, 0, 2).reshape(6, -1)
+        blocks = np.concatenate([frames, moments], axis=1)
+        if self.torsional is not None:
+            arms = self.torsional / np.where(self.friction > 0, self.friction, np.inf)
+            turn = np.concatenate([np.zeros((len(arms), 3)), arms[:, None] * self.frames[..., 2]], axis=1)
+            blocks = np.concatenate([blocks, turn[..., None]], axis=2)
+        return blocks.transpose(1, 0, 2).reshape(6, -1)
 
     @cached_property
     def cone_matrix(self) -> np.ndarray:
         """C of (1): (n_c n_e, 3 n_c), block diagonal."""
-        return scipy.linalg.block_diag(*(facet_rows(mu, self.cone_edges) for mu in self.friction))
+        rows = facet_rows if self.torsional is None else soft_facet_rows
+        return scipy.linalg.block_diag(*(rows(mu, self.cone_edges) for mu in self.friction))
 
     @cached_property
     def row_margins(self) -> np.ndarray:
         """d of (1): (n_c n_e,)."""
-        return np.broadcast_to(self.cone_margin, (len(self.positions), self.cone_edges)).reshape(-1)
+        rows = self.cone_edges * (self.components - 2)
+        return np.broadcast_to(self.cone_margin, (len(self.positions), rows)).reshape(-1)
 
     @cached_property
     def normal_matrix(self) -> np.ndarray:
         """E of (8): (n_c, 3 n_c), picks the normal components."""
-        return np.kron(np.eye(len(self.positions)), [0.0, 0.0, 1.0])
+        return np.kron(np.eye(len(self.positions)), np.eye(self.components)[2])
 
     @cached_property
     def range_basis(self) -> np.ndarray:
@@ -90,14 +104,14 @@ class Grasp:
         """
         on_range = self.range_basis.T @ (self.row_scale[:, None] * self.grasp_map)
         targets = self.vertices * self.row_scale @ self.range_basis
-        Qs = compliance_matrix(self.compliance, len(self.positions))
+        Qs = compliance_matrix(self.compliance, len(self.positions), self.components)
         felt = np.abs(self.grasp_map).max(0) > 0
         Qs = np.where(felt[:, None] & felt, Qs, np.eye(len(felt)))
         if Qs.ndim == 2:
             changes = least_norm(on_range, Qs, targets)
         else:
             changes = np.concatenate([least_norm(on_range, Q, w[None]) for Q, w in zip(Qs, targets, strict=True)])
-        return np.vstack([changes, np.zeros(3 * len(self.positions))])
+        return np.vstack([changes, np.zeros(self.components * len(self.positions))])
 
     def outside_range(self, wrenches: np.ndarray) -> np.ndarray:
         """(n,) bool: which of the (n, 6) wrenches no contact forces can balance, however large."""
@@ -134,11 +148,33 @@ def facet_rows(friction: float, edges: int) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle), np.linalg.norm(middle, axis=-1)], axis=-1)
 
 
-def compliance_matrix(compliance: np.ndarray | None, n_c: int) -> np.ndarray:
-    """(3 n_c, 3 n_c), or (n_d, 3 n_c, 3 n_c) where every direction has its own."""
+def soft_facet_rows(friction: float, edges: int) -> np.ndarray:
+    """(2 edges, 4) rows of the polytope with the edges of the pyramid and two poles of pure torsion, moments in N.
+
+    Every facet holds two neighbouring edges and a pole: it is what no edge and no pole exceeds.
+    """
+    if friction == 0:
+        return np.tile([0.0, 0.0, np.cos(np.pi / edges), 0.0], (2 * edges, 1))
+    angle = 2 * np.pi * np.arange(edges) / edges
+    edge = np.stack([friction * np.cos(angle), friction * np.sin(angle), -np.ones(edges), np.zeros(edges)], axis=-1)
+    rows = []
+    for sign in (1.0, -1.0):
+        for k in range(edges):
+            corners = np.stack(
+                [edge[k], edge[(k + 1) % edges], [0.0, 0.0, -1.0, sign * friction], [0.0, 0.0, -1.0, 0.0]]
+            )
+            # Zero at the corners, and below zero inside.
+            row = np.linalg.solve(corners, [0.0, 0.0, 0.0, -1.0])
+            rows.append(row / np.linalg.norm(row[:2]))
+    return np.array(rows)
+
+
+def compliance_matrix(compliance: np.ndarray | None, n_c: int, components: int = 3) -> np.ndarray:
+    """(3 n_c, 3 n_c), or (n_d, 3 n_c, 3 n_c) where every direction has its own; 4 for 3 with torsion."""
     if compliance is None:
-        return np.eye(3 * n_c)
-    return np.asarray(scipy.linalg.block_diag(*compliance)) if compliance.shape == (n_c, 3, 3) else compliance
+        return np.eye(components * n_c)
+    blocks = compliance.shape == (n_c, components, components)
+    return np.asarray(scipy.linalg.block_diag(*compliance)) if blocks else compliance
 
 
 def least_norm(G: np.ndarray, Q: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -173,8 +209,8 @@ def program(grasp: Grasp, every_direction: bool = False) -> Program:
     """(21), or (16) with `every_direction`, which keeps the rows of all disturbances apart."""
     F, mu = grasp.max_force, grasp.friction
     tangential = np.where(mu > 0, mu, 1.0) * F
-    columns = np.stack([tangential, tangential, F], axis=-1).reshape(-1)
-    cone_unit = np.repeat(tangential, grasp.cone_edges)
+    columns = np.stack([tangential, tangential, F, tangential][: grasp.components], axis=-1).reshape(-1)
+    cone_unit = np.repeat(tangential, len(grasp.cone_matrix) // len(F))
     rows = np.vstack([grasp.cone_matrix, -grasp.normal_matrix])
     unit = np.concatenate([cone_unit, F])
     limit = np.concatenate([-grasp.row_margins, F])
@@ -265,7 +301,7 @@ def _solve(programs: Sequence[Program]) -> np.ndarray:
 def least_effort(grasp: Grasp, margin: float, weights: np.ndarray | None = None) -> float:
     """The program (22) by Clarabel: the least 1/2 f' Q_0 f at the given margin; nan where there is no such f."""
     p = program(grasp)
-    P = p.columns[:, None] * compliance_matrix(weights, len(grasp.positions)) * p.columns
+    P = p.columns[:, None] * compliance_matrix(weights, len(grasp.positions), grasp.components) * p.columns
     unit = P.max()
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -281,10 +317,10 @@ def least_effort(grasp: Grasp, margin: float, weights: np.ndarray | None = None)
 
 
 def row_violation(grasp: Grasp, forces: np.ndarray, margin: float) -> float:
-    """How far (n_c, 3) forces overstep the rows of (21) at the given margin, as a share of f_max."""
+    """How far (n_c, 3) forces, (n_c, 4) with moments in newtons, overstep (21)'s rows at the margin, by f_max."""
     S_1, S_2 = worst_case(grasp)
     f, F = forces.reshape(-1), grasp.max_force
-    cone = (grasp.cone_matrix @ f - S_1 * margin + grasp.row_margins) / np.repeat(F, grasp.cone_edges)
+    cone = (grasp.cone_matrix @ f - S_1 * margin + grasp.row_margins) / np.repeat(F, len(S_1) // len(F))
     bound = (-(grasp.normal_matrix @ f) + S_2 * margin - F) / F
     balance = (grasp.grasp_map @ f - grasp.required_wrench) * grasp.row_scale / F.max()
     return float(max(cone.max(), bound.max(), np.abs(balance).max()))

@@ -33,6 +33,13 @@ class Case:
     load: np.ndarray
     edges: int = 8
     cone_margins: np.ndarray | float = 0.0
+    torsional: np.ndarray | None = None
+    """(n_c,), m: soft contacts, with moments m as the fourth component m mu / gamma; None for hard ones."""
+
+    @property
+    def size(self) -> int:
+        """The number of components of a contact's force."""
+        return 3 if self.torsional is None else 4
 
     @cached_property
     def units(self) -> np.ndarray:
@@ -42,10 +49,15 @@ class Case:
 
     @cached_property
     def G(self) -> np.ndarray:
-        """(6, 3 n_c) for forces in units of f_max; zero for tangents of contacts without friction."""
+        """(6, size n_c) for forces in units of f_max; zero for tangents, and moments, of contacts without friction."""
         frames = self.frames * np.stack([self.friction > 0] * 2 + [self.friction >= 0], -1)[:, None]
         moments = np.cross(self.positions[:, :, None], frames, axis=1)
-        blocks = np.concatenate([frames, moments], 1) * self.max_force[:, None, None]
+        blocks = np.concatenate([frames, moments], 1)
+        if self.torsional is not None:
+            arms = self.torsional / np.where(self.friction > 0, self.friction, np.inf)
+            turn = self.frames[..., 2] * arms[:, None]
+            blocks = np.concatenate([blocks, np.concatenate([0 * turn, turn], 1)[..., None]], 2)
+        blocks = blocks * self.max_force[:, None, None]
         return self.units[:, None] * blocks.transpose(1, 0, 2).reshape(6, -1)
 
     @cached_property
@@ -65,8 +77,8 @@ class Case:
 
     @cached_property
     def answers(self) -> np.ndarray:
-        """(n_d + 1, 3 n_c): blocking forces for one unit of lambda, then those at rest; Q = I in newtons."""
-        weights = np.repeat(self.max_force, 3)
+        """(n_d + 1, size n_c): blocking forces for one unit of lambda, then those at rest; Q = I in newtons."""
+        weights = np.repeat(self.max_force, self.size)
         G = self.G / weights
         U, s, V = np.linalg.svd(G, full_matrices=False)
         keep = s > RANK_TOLERANCE * s[0]
@@ -90,7 +102,7 @@ class Case:
 
     @cached_property
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_c (n_e + 1), 3 n_c) and right-hand sides: pyramids, then the bound on the normal force."""
+        """Rows and right-hand sides of every contact: the pyramid or, with moments, two; then the bound."""
         angles = np.pi * (2 * np.arange(self.edges) + 1) / self.edges
         blocks = []
         for mu in self.friction:
@@ -99,9 +111,12 @@ class Case:
             )
             # Without friction the finger does not pull.
             facets = facets if mu > 0 else np.tile([0, 0, np.cos(np.pi / self.edges)], (self.edges, 1))
-            blocks.append(np.vstack([facets, [[0, 0, -1.0]]]))
+            if self.torsional is not None:
+                pole = np.full((self.edges, 1), np.cos(np.pi / self.edges) * (mu > 0))
+                facets = np.vstack([np.hstack([facets, pole]), np.hstack([facets, -pole])])
+            blocks.append(np.vstack([facets, -np.eye(self.size)[2:3]]))
         shares = self.cone_margins / self.max_force[:, None]
-        sides = np.hstack([-shares + np.zeros((len(blocks), self.edges)), np.ones((len(blocks), 1))])
+        sides = np.hstack([-shares + np.zeros((len(blocks), len(blocks[0]) - 1)), np.ones((len(blocks), 1))])
         return sp.block_diag(blocks).toarray(), sides.reshape(-1)
 
     def cones(self, norm_bound: bool) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -109,13 +124,13 @@ class Case:
         n, parts = len(self.friction), []
         shares = np.broadcast_to(self.cone_margins / self.max_force[:, None], (n, 1))[:, 0]
         for i, mu in enumerate(self.friction):
-            e = np.eye(3 * n)[3 * i : 3 * i + 3]
-            coulomb = ("q", np.stack([mu * e[2], -e[0], -e[1]]), np.array([-shares[i], 0, 0]))
-            parts.append(coulomb if mu > 0 else ("l", e[2:], -shares[i : i + 1]))
+            e = np.eye(self.size * n)[self.size * i : self.size * (i + 1)]
+            coulomb = ("q", np.vstack([mu * e[2], -np.delete(e, 2, 0)]), -shares[i] * np.eye(self.size)[0])
+            parts.append(coulomb if mu > 0 else ("l", e[2:3], np.array([-shares[i]])))
             if norm_bound:
-                parts.append(("q", np.vstack([np.zeros((1, 3 * n)), -e]), np.array([1.0, 0, 0, 0])))
+                parts.append(("q", np.vstack([0 * e[:1], -e[:3]]), np.array([1.0, 0, 0, 0])))
             else:
-                parts.append(("l", -e[2:], np.ones(1)))
+                parts.append(("l", -e[2:3], np.ones(1)))
         return parts
 
 
@@ -280,27 +295,22 @@ class Batch:
     max_force: np.ndarray
     wrenches: np.ndarray
     load: np.ndarray
+    torsional: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def __getitem__(self, rows) -> Batch:
-        return Batch(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Batch(**{name: None if value is None else value[rows] for name, value in given.items()})
 
     def case(self, i: int, edges: int = 8, cone_margins: np.ndarray | float = 0.0) -> Case:
         """One of them."""
         wrenches = self.wrenches[i]
         wrenches = wrenches[np.any(wrenches != 0, -1)]
-        return Case(
-            self.positions[i],
-            self.frames[i],
-            self.friction[i],
-            self.max_force[i],
-            wrenches,
-            self.load[i],
-            edges,
-            cone_margins,
-        )
+        torsional = None if self.torsional is None else self.torsional[i]
+        given = self.positions[i], self.frames[i], self.friction[i], self.max_force[i]
+        return Case(*given, wrenches, self.load[i], edges, cone_margins, torsional)
 
 
 def _units(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -402,13 +412,15 @@ def least_total_effort(
         changes: Q, likewise, or one for each direction along the leading axis.
     """
     (A, h), size, count = case.rows, case.G.shape[1], len(case.W)
-    unit = np.repeat(case.max_force, 3)
+    unit = np.repeat(case.max_force, case.size)
 
     def whole(Q: np.ndarray | None) -> np.ndarray:
         Q = np.eye(size) if Q is None else block_diag(*Q) if Q.ndim == 3 else Q
         return unit[:, None] * Q * unit
 
-    each = [changes] * count if changes is None or changes.shape in ((size // 3, 3, 3), (size, size)) else changes
+    k = case.size
+    blocks = (size // k, k, k), (size, size)
+    each = [changes] * count if changes is None or changes.shape in blocks else changes
     weights = [whole(Q) for Q in (at_rest, *each)]
     # Unknowns f_0, then the changes.
     rows = sp.vstack(

@@ -1,8 +1,9 @@
 """Candidates as Arrow tables: a row each, with lists of contacts that may differ in length from row to row.
 
 The fields are those of archives: positions, list of three numbers each; outward_normals likewise, or frames, three rows
-of three numbers; friction, max_force and active, one value or a list with one a contact; mass. What is null is NaN, and
-so the affair of its candidate alone. Lists may be of fixed or variable size, or Arrow's fixed-shape tensors.
+of three numbers; friction, torsional_friction, max_force and active, one value or a list with one a contact; mass. What
+is null is NaN, and so the affair of its candidate alone. Lists may be of fixed or variable size, or Arrow's fixed-shape
+tensors.
 """
 
 from pathlib import Path
@@ -24,7 +25,9 @@ from jaxgrasp.candidates.reader import (
 _OWN = tuple(name for name in FIELDS if name != "center_of_mass")
 # What every contact has beside its own place, and what an absent one gets: no arithmetic on it can then yield a NaN.
 _TAILS: dict[str, tuple[int, ...]] = {"positions": (3,), "outward_normals": (3,), "frames": (3, 3)}
-_PADDING = {"positions": 0.0, "outward_normals": np.array([0.0, 0.0, 1.0]), "frames": np.eye(3), "active": 0.0}
+_PADDING = {"positions": 0.0, "outward_normals": np.array([0.0, 0.0, 1.0]), "frames": np.eye(3)} | dict.fromkeys(
+    ("active", "torsional_friction"), 0.0
+)
 # Lists of many lengths are filled up to a multiple of this, so that few programs serve them.
 _STEP = 4
 
@@ -74,6 +77,7 @@ def table_of_candidates(candidates: Candidates) -> pa.Table:
     columns = {"positions": candidates.positions, "friction": candidates.friction, "max_force": candidates.max_force}
     columns |= {"outward_normals": candidates.outward_normals, "frames": candidates.frames}
     columns |= {"active": candidates.active, "mass": candidates.mass}
+    columns["torsional_friction"] = candidates.torsional_friction
     return pa.table({name: _lists(value) for name, value in columns.items() if value is not None})
 
 

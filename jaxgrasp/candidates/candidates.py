@@ -33,6 +33,9 @@ class Candidates:
     active: Bool[np.ndarray, "batch contacts"]
     """False where a contact is absent."""
 
+    torsional_friction: Float[np.ndarray, "batch contacts"] | None = None
+    """Torsional coefficients, m, 0 for hard contacts; None where all are hard."""
+
     mass: Float[np.ndarray, " batch"]
     """Masses of the object, kg; NaN where unknown."""
 
@@ -82,6 +85,7 @@ class Candidates:
             friction=self.friction[rows],
             max_force=self.max_force[rows],
             active=self.active[rows],
+            torsional_friction=pick(self.torsional_friction),
             mass=self.mass[rows],
             hand={name: column[rows] for name, column in self.hand.items()},
             columns={name: column[rows] for name, column in self.columns.items()},
@@ -94,8 +98,9 @@ class Candidates:
 def concatenate(parts: Sequence[Candidates]) -> Candidates:
     """Puts candidates of several sources one after the other.
 
-    Sources with fewer contacts are padded with absent ones. A travelling column that a source lacks is filled with NaN
-    (numbers and booleans become float64) or with empty strings.
+    Sources with fewer contacts are padded with absent ones; contacts of those without torsional friction are hard. A
+    travelling column that a source lacks is filled with NaN (numbers and booleans become float64) or with empty
+    strings.
 
     Args:
         parts: Candidates that all give normals or all give frames.
@@ -119,6 +124,10 @@ def concatenate(parts: Sequence[Candidates]) -> Candidates:
     # Absent contacts still get a sound frame: no arithmetic on them can then yield a NaN.
     normals = [part.outward_normals for part in parts if part.outward_normals is not None]
     frames = [part.frames for part in parts if part.frames is not None]
+    hard = all(part.torsional_friction is None for part in parts)
+    torsional = [
+        np.zeros(part.friction.shape) if part.torsional_friction is None else part.torsional_friction for part in parts
+    ]
     offsets = np.cumsum([0] + [len(part.sources) for part in parts])
     names = list(dict.fromkeys(name for part in parts for name in part.columns))
     return Candidates(
@@ -128,6 +137,7 @@ def concatenate(parts: Sequence[Candidates]) -> Candidates:
         friction=join([part.friction for part in parts], 1.0),
         max_force=join([part.max_force for part in parts], 1.0),
         active=join([part.active for part in parts], False),
+        torsional_friction=None if hard else join(torsional, 0.0),
         mass=np.concatenate([part.mass for part in parts]),
         hand={name: np.concatenate([part.hand[name] for part in parts]) for name in parts[0].hand},
         columns={name: _joined_column(name, parts) for name in names},

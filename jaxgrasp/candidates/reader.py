@@ -12,7 +12,10 @@ from jaxgrasp.storage import Archive, FileError, open_archive, printable
 
 # A file of candidates, or of wrenches, cannot be used.
 CandidateError = FileError
-FIELDS = ("positions", "outward_normals", "frames", "friction", "max_force", "mass", "center_of_mass", "active")
+FIELDS = (
+    *("positions", "outward_normals", "frames", "friction", "max_force", "mass", "center_of_mass", "active"),
+    "torsional_friction",
+)
 
 # An unknown column this near to a known field that is absent is a misspelling: 'max_forces' is 0.95 from 'max_force',
 # while 'mask' is 0.75 from 'mass'. A field that is required and missing is sought from further away ('normals').
@@ -32,7 +35,8 @@ def read_candidates(
     """Reads candidate grasps from one or more `.npz` files.
 
     Fields: positions (N, n_c, 3), about the centre of mass, and outward_normals (N, n_c, 3) or frames (N, n_c, 3, 3),
-    columns t1, t2, n; optional friction and max_force, each (), (N,) or (N, n_c), where (N,) is one per candidate;
+    columns t1, t2, n; optional friction, max_force and torsional_friction (m, of soft fingertips), each (), (N,) or
+    (N, n_c), where (N,) is one per candidate;
     mass () or (N,); active (N, n_c) bool. Other columns with a leading axis of N travel along, with center_of_mass.
     Data that is not per candidate is passed over.
 
@@ -124,6 +128,7 @@ def candidates_of_arrays(
         friction=per_contact("friction", friction),
         max_force=per_contact("max_force", max_force),
         active=_active(path, arrays.get("active"), (count, contacts)),
+        torsional_friction=per_contact("torsional_friction", None) if "torsional_friction" in arrays else None,
         mass=np.broadcast_to(np.nan if mass is None else mass, (count,)),
         columns=_travelling(path, arrays, count),
         sources=(printable(path),),

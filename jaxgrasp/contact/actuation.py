@@ -25,8 +25,9 @@ class Actuation:
     `from_jacobian`.
     """
 
-    jacobian: Float[Array, "*batch contacts 3 joints"]
-    """J, velocity of each contact point on the hand in its contact frame, per unit of joint velocity; m/rad or 1."""
+    jacobian: Float[Array, "*batch contacts k joints"]
+    """J, velocity of each contact point on the hand in its contact frame, per unit of joint velocity; m/rad or 1. k =
+    3; for soft contacts 4, with the angular velocity about the normal, rad/rad or rad/m."""
     transmission: Float[Array, "*batch joints actuators"]
     """B, joint torque or force per unit of effort."""
     lower: Float[Array, "*batch actuators"]
@@ -46,7 +47,7 @@ class Actuation:
         """Actuation from Jacobians and transmission.
 
         Args:
-            jacobian: J (*batch, n_c, 3, n_v), contact frames.
+            jacobian: J (*batch, n_c, 3, n_v), contact frames; for soft contacts (*batch, n_c, 4, n_v).
             transmission: B (*batch, n_v, n_u). One that all grasps share, known while tracing, is best: the number of
                 directions without an actuator is then known, too.
             lower: u_min (*batch, n_u); may be -inf.
@@ -56,7 +57,11 @@ class Actuation:
             ValueError: shapes that do not fit. Limits that cross or are NaN make their grasp
                 `Status.INVALID_INPUT`.
         """
-        jacobian = as_float("jacobian", jacobian, ("n_c", 3, "n_v"))
+        jacobian = as_float("jacobian", jacobian, ("n_c", "3 or 4", "n_v"))
+        if jacobian.shape[-2] not in (3, 4):
+            raise ValueError(
+                f"jacobian: got shape {jacobian.shape}, wanted (*batch, n_c, 3, n_v), or 4 for soft contacts"
+            )
         joints, dtype = jacobian.shape[-1], jacobian.dtype
         given = as_float("transmission", transmission, (joints, "n_u"))
         lower, upper = (
@@ -88,9 +93,17 @@ class Actuation:
         )
 
     @own_settings()
-    def joint_torques(self, forces: Float[Array, "*batch contacts 3"]) -> Float[Array, "*batch joints"]:
-        """J'f: the joint torques that put the forces (*batch, n_c, 3), N, contact frames, on the object; N m or N."""
-        return jnp.einsum("...iav,...ia->...v", self.jacobian, forces)
+    def joint_torques(
+        self, forces: Float[Array, "*batch contacts 3"], moments: Float[Array, "*batch contacts"] | None = None
+    ) -> Float[Array, "*batch joints"]:
+        """J'f: the joint torques that put the forces (*batch, n_c, 3), N, contact frames, on the object; N m or N.
+
+        Those of soft contacts with the moments (*batch, n_c) about the normals, N m.
+        """
+        torques = jnp.einsum("...iav,...ia->...v", self.jacobian[..., :3, :], forces)
+        if moments is None:
+            return torques
+        return torques + jnp.einsum("...iv,...i->...v", self.jacobian[..., 3, :], moments)
 
     @own_settings()
     def joint_torque_weights(
@@ -106,7 +119,8 @@ class Actuation:
                 float32, a hundredth).
 
         Returns:
-            J J' + lever^2 I, (*batch, 3 n_c, 3 n_c), contact by contact in contact frames, for `effort_weights`.
+            J J' + lever^2 I, (*batch, 3 n_c, 3 n_c), contact by contact in contact frames, for `effort_weights`; of
+            soft contacts (*batch, 4 n_c, 4 n_c).
 
         Raises:
             ValueError: shapes that do not fit.

@@ -38,19 +38,19 @@ class Compliance:
 
 
 def is_full(matrices: jax.Array, contacts: int) -> bool:
-    """Whether matrices of n contacts, lanes trailing, are full (3 n, 3 n, *lanes), not blocks (n, 3, 3, *lanes)."""
-    return matrices.shape[:2] == (3 * contacts, 3 * contacts)
+    """Whether matrices of n contacts, lanes trailing, are full (k n, k n, *lanes), not blocks (n, k, k, *lanes)."""
+    return matrices.shape[0] != contacts
 
 
 def inverse_root(compliance: jax.Array | None, contacts: int) -> tuple[jax.Array | None, jax.Array]:
     """Compute M with M M' = Q^-1, lanes trailing, and whether Q is symmetric positive definite.
 
     Args:
-        compliance: None for Q = I; blocks (n, 3, 3, *lanes) or full (3 n, 3 n, *lanes).
+        compliance: None for Q = I; blocks (n, k, k, *lanes) or full (k n, k n, *lanes), k = 3, or 4 for soft contacts.
         contacts: n.
 
     Returns:
-        M, blocks (n, 3, 3, *lanes) or full (3 n, 3 n, *lanes): the identity where Q is not usable, None for Q = I; and
+        M, shaped like Q: the identity where Q is not usable, None for Q = I; and
         bool (*lanes), whether Q is usable.
     """
     if compliance is None:
@@ -86,7 +86,7 @@ def _inverse_root_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 @jax.custom_jvp
 def _inverse(rows: jax.Array) -> tuple[jax.Array, Basis]:
-    """Compute N^+ (3, 6, n, *lanes) of N (6, 3, n, *lanes), and the basis B = T N of its rows.
+    """Compute N^+ (k, 6, n, *lanes) of N (6, k, n, *lanes), and the basis B = T N of its rows.
 
     B has orthonormal rows, so N^+ = B'T.
     """
@@ -131,11 +131,11 @@ def pseudo_inverse(columns: jax.Array, root: jax.Array | None) -> tuple[jax.Arra
     With M M' = Q^-1 and N = G M it is G* = M N^+.
 
     Args:
-        columns: blocks of G, (6, 3, n, *lanes), zero where a contact is absent.
+        columns: blocks of G, (6, k, n, *lanes), zero where a contact is absent.
         root: M from `inverse_root`.
 
     Returns:
-        Blocks of G*, (3, 6, n, *lanes), and the basis of the rows of N.
+        Blocks of G*, (k, 6, n, *lanes), and the basis of the rows of N.
     """
     inverse, basis = _inverse(_times_root(columns, root))
     if root is None:
@@ -152,9 +152,9 @@ def pseudo_inverse_adjoint(
     K = N^+'N^+.
 
     Args:
-        columns: blocks of G, (6, 3, n, *lanes).
+        columns: blocks of G, (6, k, n, *lanes).
         root: M from `inverse_root`.
-        pulled: cotangents of the blocks of G*, (6, 3, n, *lanes).
+        pulled: cotangents of the blocks of G*, (6, k, n, *lanes).
 
     Returns:
         Cotangents of columns and of M (None for Q = I).
@@ -193,28 +193,28 @@ def _transposed(root: jax.Array, contacts: int) -> jax.Array:
 
 
 def _times_root(columns: jax.Array, root: jax.Array | None) -> jax.Array:
-    """Compute G M, (6, 3, n, *lanes)."""
+    """Compute G M, (6, k, n, *lanes)."""
     if root is None:
         return columns
     if not is_full(root, columns.shape[2]):
         return jnp.einsum("rcn...,nca...->ran...", columns, root)
     tall = jnp.einsum("rp...,pq...->rq...", _flatten(columns), root)
-    return _unflatten(tall)
+    return _unflatten(tall, columns)
 
 
 def _root_times(rows: jax.Array, root: jax.Array) -> jax.Array:
-    """Compute M q for every row q, (6, 3, n, *lanes)."""
+    """Compute M q for every row q, (6, k, n, *lanes)."""
     if not is_full(root, rows.shape[2]):
         return jnp.einsum("nac...,rcn...->ran...", root, rows)
-    return _unflatten(jnp.einsum("pq...,rq...->rp...", root, _flatten(rows)))
+    return _unflatten(jnp.einsum("pq...,rq...->rp...", root, _flatten(rows)), rows)
 
 
 def _flatten(blocks: jax.Array) -> jax.Array:
-    """Reshape (6, 3, n, *lanes) to (6, 3 n, *lanes), contact by contact."""
+    """Reshape (6, k, n, *lanes) to (6, k n, *lanes), contact by contact."""
     swapped = jnp.swapaxes(blocks, 1, 2)
     return swapped.reshape(blocks.shape[0], -1, *blocks.shape[3:])
 
 
-def _unflatten(rows: jax.Array) -> jax.Array:
-    """Reshape (6, 3 n, *lanes) to (6, 3, n, *lanes)."""
-    return jnp.swapaxes(rows.reshape(rows.shape[0], -1, 3, *rows.shape[2:]), 1, 2)
+def _unflatten(rows: jax.Array, like: jax.Array) -> jax.Array:
+    """Reshape (6, k n, *lanes) to blocks like (6, k, n, *lanes)."""
+    return jnp.swapaxes(rows.reshape(rows.shape[0], -1, like.shape[1], *rows.shape[2:]), 1, 2)

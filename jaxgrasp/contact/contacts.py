@@ -1,11 +1,13 @@
 """Contacts: where the fingers touch, with which friction and strength."""
 
 import functools
+import warnings
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -17,7 +19,10 @@ from jaxgrasp.records import record
 
 @record
 class Contacts:
-    """A batch of grasps by their hard-finger contacts, in the object frame about the centre of mass.
+    """A batch of grasps by their contacts, in the object frame about the centre of mass.
+
+    Contacts are hard: points with friction. With `torsional_friction` they are soft, and bear a moment about the
+    normal, too.
 
     Every leaf has the full batch shape, so that ``jax.vmap(f)(contacts)`` works. Make one with `from_normals` or
     `from_frames`.
@@ -33,6 +38,9 @@ class Contacts:
     """Largest normal force, N; bounds the normal component (8), not the norm."""
     active: Bool[Array, "*batch contacts"]
     """False where a contact is absent: it counts as if it had never been there, whatever its other data."""
+    torsional_friction: Float[Array, "*batch contacts"] | None = None
+    """gamma, m: the moment m about the normal is bounded by |f_t|^2 / mu^2 + m^2 / gamma^2 <= f_n^2. 0 is a hard
+    contact; None makes all contacts hard, and programs smaller."""
 
     @classmethod
     def from_frames(
@@ -43,6 +51,7 @@ class Contacts:
         friction: ArrayLike,
         max_force: ArrayLike,
         active: ArrayLike | None = None,
+        torsional_friction: ArrayLike | None = None,
     ) -> "Contacts":
         """Contacts whose tangents are given.
 
@@ -52,6 +61,7 @@ class Contacts:
             friction: scalar or (*batch, n_c), >= 0.
             max_force: scalar or (*batch, n_c), N, finite and positive.
             active: bool (*batch, n_c); None means that every contact is there.
+            torsional_friction: scalar or (*batch, n_c), m, >= 0, as MuJoCo has it for condim 4; None is no moment.
 
         Raises:
             ValueError: shapes that do not fit. Data that are not admissible are not errors here: the grasp that has
@@ -70,7 +80,11 @@ class Contacts:
                 f"frames: got shape {frames.shape}, wanted (*batch, n_c, 3, 3) "
                 f"with the n_c >= 1 of positions {positions.shape}"
             )
-        for name, value in (("friction", friction), ("max_force", max_force), ("active", present)):
+        given = {"friction": friction, "max_force": max_force, "active": present}
+        if torsional_friction is not None:
+            given["torsional_friction"] = as_float("torsional_friction", torsional_friction, ())
+            _doubt_ratios(given["torsional_friction"])
+        for name, value in given.items():
             if value.ndim and value.shape[-1] != n_c:
                 raise ValueError(
                     f"{name}: got shape {value.shape}, wanted a scalar or (*batch, {n_c}), one for each contact"
@@ -78,13 +92,11 @@ class Contacts:
         batch = broadcast_batch(
             positions=positions.shape[:-2],
             frames=frames.shape[:-3],
-            friction=friction.shape[:-1],
-            max_force=max_force.shape[:-1],
-            active=present.shape[:-1],
+            **{name: value.shape[:-1] for name, value in given.items()},
         )
-        leaves = positions, frames, friction, max_force, present
+        leaves = positions, frames, *given.values()
         spread = _spread_directly if is_direct(leaves) else _spread
-        return cls(**dict(zip(_EVENTS, spread(batch, leaves), strict=True)))
+        return cls(**dict(zip(_EVENTS, spread(batch, leaves), strict=False)))
 
     @classmethod
     def from_normals(
@@ -95,6 +107,7 @@ class Contacts:
         friction: ArrayLike,
         max_force: ArrayLike,
         active: ArrayLike | None = None,
+        torsional_friction: ArrayLike | None = None,
     ) -> "Contacts":
         """Contacts whose tangents follow from the normals, by a rule that rounding does not change.
 
@@ -108,6 +121,7 @@ class Contacts:
             friction: scalar or (*batch, n_c), >= 0.
             max_force: scalar or (*batch, n_c), N, finite and positive.
             active: bool (*batch, n_c); None means that every contact is there.
+            torsional_friction: scalar or (*batch, n_c), m, >= 0, as MuJoCo has it for condim 4; None is no moment.
 
         Raises:
             ValueError: shapes that do not fit.
@@ -119,7 +133,8 @@ class Contacts:
                 f"outward_normals: got shape {normals.shape}, wanted (*batch, {n_c}, 3) "
                 f"like positions {jnp.shape(positions)}"
             )
-        return cls.from_frames(positions, _frames(normals), friction=friction, max_force=max_force, active=active)
+        given = {"friction": friction, "max_force": max_force, "active": active}
+        return cls.from_frames(positions, _frames(normals), torsional_friction=torsional_friction, **given)
 
     @classmethod
     def from_dlpack(
@@ -130,6 +145,7 @@ class Contacts:
         friction: Any,
         max_force: Any,
         active: Any | None = None,
+        torsional_friction: Any | None = None,
     ) -> "Contacts":
         """Contacts in arrays of another library (PyTorch, CuPy, NumPy), which share their memory where JAX can read it.
 
@@ -143,18 +159,22 @@ class Contacts:
             friction: (*batch, n_c), >= 0; or a number.
             max_force: (*batch, n_c), N, finite and positive; or a number.
             active: bool (*batch, n_c); None means that every contact is there.
+            torsional_friction: (*batch, n_c), m, >= 0; or a number; None is no moment.
 
         Raises:
             ValueError: shapes that do not fit.
         """
         leaves = {"positions": positions, "frames": frames, "friction": friction, "max_force": max_force}
         leaves["active"] = True if active is None else active
+        if torsional_friction is not None:
+            leaves["torsional_friction"] = torsional_friction
         found = {name: jnp.from_dlpack(x) for name, x in leaves.items() if hasattr(x, "__dlpack__")}
         for name in ("positions", "frames"):
             if name not in found:
                 raise ValueError(f"{name}: got {type(leaves[name]).__name__}, wanted an array with __dlpack__")
         shape, dtype = found["positions"].shape[:-1], found["positions"].dtype
-        for name, event in _EVENTS.items():
+        for name in leaves:
+            event = _EVENTS[name]
             kind = jnp.bool_ if name == "active" else dtype
             if name not in found:
                 found[name] = jnp.full(shape, leaves[name], kind)
@@ -183,10 +203,42 @@ class Contacts:
         """Number of contacts, absent ones included."""
         return self.positions.shape[-2]
 
+    @property
+    def components(self) -> int:
+        """How many components a contact's force has in the programs: 3, and a fourth for the moment of soft ones."""
+        return 3 if self.torsional_friction is None else 4
+
+    @property
+    def torsional_arms(self) -> Float[Array, "*batch contacts"] | None:
+        """The lengths gamma / mu, m, None for hard contacts: moments m count as tangential forces m / arm, N.
+
+        These use up as much of the friction, since |f_t|^2 + (m / arm)^2 <= mu^2 f_n^2. 0 where there is no friction.
+        """
+        if self.torsional_friction is None:
+            return None
+        least = LEAST_FRICTION[self.friction.dtype.name]
+        return jnp.where(self.friction == 0, 0, self.torsional_friction / jnp.maximum(self.friction, least))
+
 
 # Their frames take no time, however few they are.
 _FEW_NORMALS = 1024
-_EVENTS = {"positions": (3,), "frames": (3, 3), "friction": (), "max_force": (), "active": ()}
+_EVENTS = {"positions": (3,), "frames": (3, 3), "friction": (), "max_force": (), "active": (), "torsional_friction": ()}
+# Friction coefficients above 0 count as no less than this: tangential forces then stay as small in units of max_force.
+LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
+# Longer torsional coefficients, in metres, are ratios by mistake, or those of pads as large as a plate.
+_LONGEST = 0.5
+
+
+def _doubt_ratios(torsional_friction: jax.Array) -> None:
+    """Warn of coefficients that are no lengths of fingertips, where they are known."""
+    if isinstance(torsional_friction, Tracer) or not is_direct([torsional_friction]):
+        return
+    largest = float(np.max(np.asarray(torsional_friction), initial=0))
+    if largest > _LONGEST:
+        warnings.warn(
+            f"torsional_friction: got {largest:.3g}, wanted metres (0.02 for example), not a ratio to friction",
+            stacklevel=3,
+        )
 
 
 @functools.partial(compiled, static_argnums=(0,), pace=by_size)
@@ -196,7 +248,7 @@ def _spread(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> list[jax.A
     dtype, n_c = jnp.result_type(positions, frames), positions.shape[-2]
     return [
         jnp.broadcast_to(x if x.dtype == bool else x.astype(dtype), (*batch, n_c, *event))
-        for x, event in zip(leaves, _EVENTS.values(), strict=True)
+        for x, event in zip(leaves, _EVENTS.values(), strict=False)
     ]
 
 
@@ -206,7 +258,7 @@ def _spread_directly(batch: tuple[int, ...], leaves: tuple[jax.Array, ...]) -> l
     dtype, n_c = jnp.result_type(positions, frames), positions.shape[-2]
     return [
         jax.device_put(np.broadcast_to(np.asarray(x, x.dtype if x.dtype == bool else dtype), (*batch, n_c, *event)))
-        for x, event in zip(leaves, _EVENTS.values(), strict=True)
+        for x, event in zip(leaves, _EVENTS.values(), strict=False)
     ]
 
 

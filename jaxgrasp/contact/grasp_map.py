@@ -14,18 +14,23 @@ from jaxgrasp.compiling import own_settings
 from jaxgrasp.contact.contacts import Contacts
 
 
-def grasp_columns(positions: jax.Array, frames: jax.Array) -> jax.Array:
-    """The blocks [R_i; p_i x R_i] of G, components leading.
+def grasp_columns(positions: jax.Array, frames: jax.Array, arms: jax.Array | None = None) -> jax.Array:
+    """The blocks [R_i; p_i x R_i] of G, components leading; for soft contacts with a column [0; arm n].
 
     Args:
         positions: (3, ...), m.
         frames: (3, 3, ...), columns t1, t2, n.
+        arms: (...), m: moments about the normals per newton of the fourth component; None for hard contacts.
 
     Returns:
-        (6, 3, ...).
+        (6, 3, ...), (6, 4, ...) for soft contacts.
     """
     moments = jnp.stack([jnp.stack(_cross(positions, frames[:, a])) for a in range(3)], 1)
-    return jnp.concatenate([frames, moments], 0)
+    columns = jnp.concatenate([frames, moments], 0)
+    if arms is None:
+        return columns
+    torsion = jnp.concatenate([jnp.zeros_like(frames[:, 2]), arms * frames[:, 2]])
+    return jnp.concatenate([columns, torsion[:, None]], 1)
 
 
 @own_settings()
@@ -36,13 +41,16 @@ def grasp_map(contacts: Contacts) -> Float[Array, "*batch 6 vars"]:
         contacts: the grasps; the columns of absent contacts are zero.
 
     Returns:
-        (*batch, 6, 3 n_c); rows force (N), moment (N m), object frame.
+        (*batch, 6, 3 n_c); rows force (N), moment (N m), object frame. With torsional friction (*batch, 6, 4 n_c): each
+        contact has a fourth column, for its moment about the normal in N m; zero where the coefficient is.
     """
     positions = jnp.moveaxis(contacts.positions, -1, 0)
     frames = jnp.moveaxis(contacts.frames, (-2, -1), (0, 1))
-    blocks = jnp.where(contacts.active, grasp_columns(positions, frames), 0)
+    torsional = contacts.torsional_friction
+    soft = None if torsional is None else (torsional > 0).astype(positions.dtype)
+    blocks = jnp.where(contacts.active, grasp_columns(positions, frames, soft), 0)
     blocks = jnp.moveaxis(blocks, (0, 1), (-3, -1))
-    return blocks.reshape(*contacts.batch_shape, 6, 3 * contacts.n_c)
+    return blocks.reshape(*contacts.batch_shape, 6, contacts.components * contacts.n_c)
 
 
 @own_settings()

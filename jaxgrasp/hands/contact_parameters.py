@@ -19,6 +19,8 @@ class ContactParameters(NamedTuple):
     margin: float
     """Contacts push up to this distance, m."""
     condim: int
+    torsional: float
+    """The torsional coefficient, m; 0 where condim is below 4."""
     solref: np.ndarray
     """(2,), MuJoCo's."""
     solimp: np.ndarray
@@ -76,14 +78,21 @@ def coulomb(friction: np.ndarray, condim: np.ndarray | int) -> np.ndarray:
     return np.where(np.asarray(condim) == 1, 0.0, friction[..., :2].min(-1))
 
 
+def torsion(friction: np.ndarray, condim: np.ndarray | int) -> np.ndarray:
+    """The torsional coefficient of MuJoCo's (..., 5), m: none where condim is below 4."""
+    return np.where(np.asarray(condim) < 4, 0.0, friction[..., 2])
+
+
 def _combined(model: mujoco.MjModel, a: int, b: int) -> ContactParameters:
     """Of the geom with the higher priority, the larger ones where these are equal; margins add up."""
     rows = [a, b]
     if model.geom_priority[a] != model.geom_priority[b]:
         rows = [a if model.geom_priority[a] > model.geom_priority[b] else b]
-    sliding = model.geom_friction[rows, 0].max()
+    sliding, twisting, _ = model.geom_friction[rows].max(0)
     margin = model.geom_margin[[a, b]].sum()
-    return _parameters(np.full(2, sliding), margin, model.geom_condim[rows].max(), *_solver(model, rows))
+    return _parameters(
+        np.array([sliding, sliding, twisting]), margin, model.geom_condim[rows].max(), *_solver(model, rows)
+    )
 
 
 def _solver(model: mujoco.MjModel, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -100,15 +109,15 @@ def _parameters(
     friction: np.ndarray, margin: float, condim: int, solref: np.ndarray, solimp: np.ndarray
 ) -> ContactParameters:
     least, most = coulomb(friction, condim), -coulomb(-friction, condim)
-    return ContactParameters(float(least), float(most), float(margin), int(condim), np.array(solref), np.array(solimp))
+    coefficients = float(least), float(most), float(margin), int(condim), float(torsion(friction, condim))
+    return ContactParameters(*coefficients, np.array(solref), np.array(solimp))
 
 
 def warn_of_simplifications(model: mujoco.MjModel, found: dict[tuple[int, int], ContactParameters]) -> None:
     """Warns of what of the contacts is not modelled."""
-    if any(parameters.condim > 3 for parameters in found.values()):
+    if any(parameters.condim > 4 for parameters in found.values()):
         warnings.warn(
-            "scene: contacts have condim 4 or 6, whose torsional and rolling friction is left out: margins are those "
-            "of condim 3",
+            "scene: contacts have condim 6, whose rolling friction is left out: margins are those of condim 4",
             stacklevel=3,
         )
     for pair, parameters in found.items():

@@ -53,8 +53,9 @@ class DistanceEngine:
         poses, rotation, centre = self.frames(qpos)
         near, table = self.points(poses), self.table
         reach = np.maximum(self._distance, table.margin).astype(qpos.dtype)
-        friction = table.friction.astype(qpos.dtype)
-        return self.geometry(qpos, poses, rotation, centre, RawPoints(*near, table.link, friction, reach))
+        friction, torsional = (x.astype(qpos.dtype) for x in (table.friction, table.torsional))
+        raw = RawPoints(*near, table.link, friction, reach, torsional)
+        return self.geometry(qpos, poses, rotation, centre, raw)
 
     def geometry(
         self, qpos: jax.Array, poses: Poses, rotation: jax.Array, centre: jax.Array, points: RawPoints

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxgrasp import linalg
 from jaxgrasp.contact import Actuation, Contacts
 from jaxgrasp.records import record
 
@@ -52,3 +53,21 @@ class HandGrasps:
         turned = jnp.einsum("...ij,...cjk,...ck->...ci", self.object_rotation, self.contacts.frames, forces)
         points = jnp.einsum("...ij,...cj->...ci", self.object_rotation, self.contacts.positions)
         return points + self.object_position[..., None, :], turned
+
+
+def contact_compliance(
+    contacts: Contacts, jacobian: Array, joint_stiffness: Array, tip_stiffness: Array
+) -> Float[Array, "*batch rows rows"]:
+    """J K^+ J' + K_tip^-1 of contacts, see `HandObject.compliance`."""
+    tall = jacobian.reshape(*jacobian.shape[:-3], -1, jacobian.shape[-1])
+    tips = jnp.broadcast_to(1 / tip_stiffness, jacobian.shape[:-2]) if tip_stiffness.ndim == 0 else 1 / tip_stiffness
+    tips = jnp.repeat(tips, jacobian.shape[-2], -1)
+    arms = contacts.torsional_arms
+    if arms is not None:
+        # Where a contact bears no moment any number will do.
+        turning = jnp.where(arms > 0, 1 / jnp.where(arms > 0, arms, 1) ** 2, 1)
+        weights = jnp.concatenate([jnp.ones((*arms.shape, 3), arms.dtype), turning[..., None]], -1)
+        tips = tips * weights.reshape(*arms.shape[:-1], -1)
+    tips = jnp.broadcast_to(tips, tall.shape[:-1])
+    reached = tall @ linalg.pinv(joint_stiffness, 1e-9) @ jnp.swapaxes(tall, -1, -2)
+    return reached + tips[..., None] * jnp.eye(tall.shape[-2], dtype=tall.dtype)

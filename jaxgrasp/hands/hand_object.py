@@ -14,7 +14,6 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgrasp import linalg
 from jaxgrasp.arrays import as_float, frames_from_normals
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Actuation, Contacts
@@ -33,7 +32,7 @@ from jaxgrasp.hands.contact_parameters import hand_object_pairs, warn_of_simplif
 from jaxgrasp.hands.couplings import Couplings, held_by_welds, read_couplings
 from jaxgrasp.hands.distance_engine import DistanceEngine
 from jaxgrasp.hands.engines import Engine, engine_for
-from jaxgrasp.hands.grasps import HandGrasps
+from jaxgrasp.hands.grasps import HandGrasps, contact_compliance
 from jaxgrasp.hands.kinematics import BALL, HINGE, SLIDE, Kinematics, Poses
 from jaxgrasp.hands.link_contacts import ContactRule, RawPoints
 from jaxgrasp.hands.mechanics import Mechanics, point_velocities
@@ -65,6 +64,8 @@ class HandObject:
     max_force: float
     friction: float | None
     couplings: Couplings
+    soft: bool
+    """Whether some contacts have torsional friction (condim 4 or 6)."""
     touching_links: np.ndarray
     """The bodies of the hand that can touch the object."""
     _actuators: Actuators
@@ -102,7 +103,8 @@ class HandObject:
             max_contacts: Of how many links a grasp keeps the contacts, the nearest ones; where every point is a
                 contact, how many points, of all links in turn. None is all.
             max_force: Largest normal force of every contact, N.
-            friction: Coulomb's coefficient for all contacts; None is what MuJoCo makes of the geoms'.
+            friction: Coulomb's coefficient for all contacts; None is what MuJoCo makes of the geoms'. Torsional
+                coefficients are always the geoms', where condim asks for them.
             unreached: What joint directions do that neither an actuator nor a friction, a stop or a spring of a joint
                 reaches: "held" bear any torque, "free" none.
 
@@ -146,6 +148,7 @@ class HandObject:
             max_force=float(max_force),
             friction=friction,
             couplings=couplings,
+            soft=any(parameters.condim > 3 for parameters in pairs.values()),
             touching_links=np.unique(model.geom_bodyid[[geom for geom, _ in pairs]]),
             _actuators=actuators,
             _mechanics=Mechanics(model, joints, couplings, actuators, read_passive(model, joints), unreached),
@@ -255,7 +258,8 @@ class HandObject:
             tip_stiffness: Of every fingertip, N/m: scalar, or (*batch, n_c).
 
         Returns:
-            (*batch, 3 n_c, 3 n_c), m/N, contact frames.
+            (*batch, 3 n_c, 3 n_c), m/N, contact frames. Of soft contacts (*batch, 4 n_c, 4 n_c), with moments about the
+            normals; a fingertip then is k (gamma / mu)^2 N m/rad stiff against turning, as in MuJoCo.
 
         Raises:
             ValueError: An actuator without stiffness, a motor for example.
@@ -266,12 +270,7 @@ class HandObject:
         if soft:
             raise ValueError(f"compliance: actuators {', '.join(soft)} have no stiffness; wanted position servos")
         stiffness = as_float("tip_stiffness", tip_stiffness, ())
-        jacobian = grasps.actuation.jacobian
-        tall = jacobian.reshape(*jacobian.shape[:-3], 3 * jacobian.shape[-3], jacobian.shape[-1])
-        tips = jnp.broadcast_to(1 / stiffness, jacobian.shape[:-2]) if stiffness.ndim == 0 else 1 / stiffness
-        tips = jnp.broadcast_to(jnp.repeat(tips, 3, -1), tall.shape[:-1])
-        reached = tall @ linalg.pinv(grasps.joint_stiffness, 1e-9) @ jnp.swapaxes(tall, -1, -2)
-        return reached + tips[..., None] * jnp.eye(tall.shape[-2], dtype=tall.dtype)
+        return contact_compliance(grasps.contacts, grasps.actuation.jacobian, grasps.joint_stiffness, stiffness)
 
     @property
     def slot_links(self) -> np.ndarray:
@@ -346,11 +345,12 @@ class HandObject:
             friction=found.friction if self.friction is None else self.friction,
             max_force=self.max_force,
             active=found.active | ~admissible[:, None],
+            torsional_friction=found.torsional if self.soft else None,
         )
         mechanics = dict.fromkeys(("actuation", "spring_torques", "spring_efforts", "joint_stiffness"))
         if actuation:
             moved, frames = xp.asarray(self.moved_bodies)[found.link], xp.asarray(contacts.frames)
-            jacobian = self._mechanics.jacobians(geometry, found.position, moved, frames, rotation, xp)
+            jacobian = self._mechanics.jacobians(geometry, found.position, moved, frames, rotation, self.soft, xp)
             joints = safe[:, self.model.jnt_qposadr[self.joints]]
             mechanics = self._mechanics.actuation(geometry, joints, jacobian, not engine.differentiable, xp)
         weight = wrench_against_weight(self.model, bodies_below(self.model, self.object_body), rotation, xp)
@@ -390,11 +390,11 @@ class HandObject:
     def actuation_at(
         self, qpos: jax.Array, poses: Poses, world: jax.Array, rotation: jax.Array, frames: jax.Array, links: jax.Array
     ) -> Actuation | None:
-        """What the hand can do at given points (n, n_c, 3) of its links, m, world frame."""
+        """What the hand can do with hard contacts at given points (n, n_c, 3) of its links, m, world frame."""
         none = jnp.zeros((len(qpos), 0), qpos.dtype)
-        points = RawPoints(world, world, none, none, none, none)
+        points = RawPoints(world, world, none, none, none, none, none)
         geometry = self._distances.geometry(qpos, poses, rotation, world[:, 0], points)
         moved = jnp.asarray(self.moved_bodies)[links]
-        jacobian = self._mechanics.jacobians(geometry, world, moved, frames, rotation, jnp)
+        jacobian = self._mechanics.jacobians(geometry, world, moved, frames, rotation, False, jnp)
         joints = qpos[:, self.model.jnt_qposadr[self.joints]]
         return self._mechanics.actuation(geometry, joints, jacobian, False, jnp)["actuation"]

@@ -37,6 +37,8 @@ class RawPoints(NamedTuple):
     """(slots,) or (n, slots), Coulomb's coefficient, 0 for contacts without friction."""
     reach: Array
     """(slots,) or (n, slots), the distance up to which a point counts as a contact, m."""
+    torsional: Array
+    """(slots,) or (n, slots), the torsional coefficient, m, 0 for hard contacts."""
 
 
 class LinkContacts(NamedTuple):
@@ -50,6 +52,8 @@ class LinkContacts(NamedTuple):
     """(n, contacts), the least of the points', m; inf in slots without a point."""
     friction: Array
     """(n, contacts), the least of the points'."""
+    torsional: Array
+    """(n, contacts), likewise."""
     link: Array
     """(n, contacts)."""
     active: Array
@@ -119,11 +123,13 @@ def _picked(x: Array, order: Array, xp: ModuleType) -> Array:
 
 
 def _all_points(raw: RawPoints, xp: ModuleType) -> LinkContacts:
-    friction, link, reach = (xp.broadcast_to(x, raw.distance.shape) for x in (raw.friction, raw.link, raw.reach))
+    friction, link, reach, torsional = (
+        xp.broadcast_to(x, raw.distance.shape) for x in (raw.friction, raw.link, raw.reach, raw.torsional)
+    )
     there = xp.isfinite(raw.distance)
     position, normal = _filled(raw, there, xp)
     active = there & (raw.distance <= reach)
-    return LinkContacts(position, normal, raw.distance, friction, link, active, active, active)
+    return LinkContacts(position, normal, raw.distance, friction, torsional, link, active, active, active)
 
 
 def _of_link(raw: RawPoints, link: int, count: int, xp: ModuleType) -> LinkContacts:
@@ -136,7 +142,7 @@ def _of_link(raw: RawPoints, link: int, count: int, xp: ModuleType) -> LinkConta
     else:
         mine = (raw.link == link) & xp.isfinite(raw.distance)
     distance = xp.where(mine, raw.distance, np.inf)
-    friction = xp.broadcast_to(raw.friction, distance.shape)
+    friction, torsional = (xp.broadcast_to(x, distance.shape) for x in (raw.friction, raw.torsional))
     position, normal = _filled(raw, mine, xp)
     near = distance <= raw.reach
     active = near.any(-1)
@@ -165,6 +171,7 @@ def _of_link(raw: RawPoints, link: int, count: int, xp: ModuleType) -> LinkConta
                 friction=_least(friction, points, xp),
                 link=xp.full(distance.shape[:1], link),
                 active=is_there,
+                torsional=_least(torsional, points, xp),
                 touching=active,
                 left_out=active,
             )

@@ -110,9 +110,16 @@ class Mechanics:
         return same and not len(self._columns.stops)
 
     def jacobians(
-        self, geometry: Geometry, points: Array, moved: Array, frames: Array, rotation: Array, xp: ModuleType
+        self,
+        geometry: Geometry,
+        points: Array,
+        moved: Array,
+        frames: Array,
+        rotation: Array,
+        soft: bool,
+        xp: ModuleType,
     ) -> Array:
-        """J (n, contacts, 3, dofs) in contact frames.
+        """J (n, contacts, 3, dofs) in contact frames; of soft contacts (n, contacts, 4, dofs).
 
         Args:
             geometry: Where the joints are.
@@ -120,12 +127,18 @@ class Mechanics:
             moved: (n, contacts, dofs), which joints move the link of a contact.
             frames: (n, contacts, 3, 3), in the object's frame.
             rotation: (n, 3, 3), of the object.
+            soft: Whether the angular velocities about the normals are wanted, too.
             xp: numpy or jax.numpy.
         """
         velocity = point_velocities(geometry.axes, geometry.anchors, self._hinge, points, moved, xp)
         # Contacts that are not admissible have no frames.
         turned = xp.einsum("nij,ncja->ncia", rotation, xp.where(xp.isnan(frames), 0, frames))
-        return xp.einsum("ncia,ncvi->ncav", turned, velocity)
+        jacobian = xp.einsum("ncia,ncvi->ncav", turned, velocity)
+        if not soft:
+            return jacobian
+        spin = xp.einsum("nci,nvi->ncv", turned[..., 2], geometry.axes)
+        spin = xp.where(moved & self._hinge, spin, 0)
+        return xp.concatenate([jacobian, spin[:, :, None]], 2)
 
     def actuation(
         self, geometry: Geometry, joints: Array, jacobian: Array, stops: bool, xp: ModuleType

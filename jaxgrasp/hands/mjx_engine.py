@@ -97,7 +97,8 @@ class MjxEngine:
         """What is where in configurations (n, nq)."""
         slots = self.slots
         parameters = [self._pairs[pair] for pair in slots.pairs]
-        friction, margin = (np.array([getattr(p, name) for p in parameters]) for name in ("friction", "margin"))
+        names = ("friction", "margin", "torsional")
+        friction, margin, torsional = (np.array([getattr(p, name) for p in parameters]) for name in names)
         reach = np.maximum(self._distance, margin)
         with allowing_mjx():
             device, data = mjx_of(self._model)
@@ -111,6 +112,7 @@ class MjxEngine:
             link=self._scene.geom_bodyid[[geom for geom, _ in slots.pairs]],
             friction=friction.astype(qpos.dtype),
             reach=reach.astype(qpos.dtype),
+            torsional=torsional.astype(qpos.dtype),
         )
         lengths, moments = transmission_of(self._scene, self._joints, self._actuators, qpos)
         springs = spring_torques(self._scene, self._joints, qpos, jnp)

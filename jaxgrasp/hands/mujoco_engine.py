@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from jaxgrasp.hands.actuators import Actuators
-from jaxgrasp.hands.contact_parameters import coulomb
+from jaxgrasp.hands.contact_parameters import coulomb, torsion
 from jaxgrasp.hands.engines import Geometry
 from jaxgrasp.hands.link_contacts import RawPoints
 
@@ -77,7 +77,7 @@ class MujocoEngine:
         return rows
 
     def _points(self, data: mujoco.MjData) -> list[np.ndarray]:
-        """Of hand and object: position, normal, distance, link, friction, reach."""
+        """Of hand and object: position, normal, distance, link, friction, reach, torsional friction."""
         contact = data.contact
         geoms = contact.geom
         of_object, of_hand = self._is_object[geoms], self._is_hand[geoms]
@@ -88,8 +88,8 @@ class MujocoEngine:
         # MuJoCo's normal points from the first geom to the second.
         normal = np.where(first, 1.0, -1.0)[:, None] * contact.frame[rows, :3]
         reach = np.maximum(self._distance, contact.includemargin[rows] - self._distance)
-        friction = coulomb(contact.friction[rows], contact.dim[rows])
-        return [contact.pos[rows], normal, contact.dist[rows], link, friction, reach]
+        friction, torsional = (each(contact.friction[rows], contact.dim[rows]) for each in (coulomb, torsion))
+        return [contact.pos[rows], normal, contact.dist[rows], link, friction, reach, torsional]
 
     def _state(self, data: mujoco.MjData, moment: np.ndarray) -> list[np.ndarray]:
         return [
@@ -115,6 +115,6 @@ def _joined(chunks: list[list[list[np.ndarray]]]) -> Geometry:
             row[: len(part)] = part
         return out
 
-    fillers = (0, 0, np.inf, 0, 0, 0)
-    points = RawPoints(*(padded(parts, filler) for parts, filler in zip(columns[:6], fillers, strict=True)))
-    return Geometry(points, *map(np.stack, columns[6:]))
+    fillers = (0, 0, np.inf, 0, 0, 0, 0)
+    points = RawPoints(*(padded(parts, filler) for parts, filler in zip(columns[:7], fillers, strict=True)))
+    return Geometry(points, *map(np.stack, columns[7:]))

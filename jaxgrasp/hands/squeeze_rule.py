@@ -141,7 +141,8 @@ def squeezable(hand: HandObject, qpos: Float[np.ndarray, "n nq"], grasps: HandGr
         frames=np.where(active[..., None, None], contacts.frames, np.eye(3)),
         friction=contacts.friction,
         active=active,
-        jacobian=inside(actuation.jacobian),
+        # Moments about the normals take no part: hard fingers squeeze.
+        jacobian=inside(actuation.jacobian[..., :3, :]),
         gap=np.where(active, np.asarray(grasps.distances), 0),
         softness=depths(hand, np.asarray(grasps.links), np.linspace(0, hand.max_force, _STEPS)),
         transmission=transmission,

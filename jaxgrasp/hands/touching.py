@@ -59,6 +59,8 @@ class PairTable:
     """(slots,), sliding friction by MuJoCo's rule."""
     margin: np.ndarray
     """(slots,), up to which distance MuJoCo's contacts push, m."""
+    torsional: np.ndarray
+    """(slots,), torsional coefficients, m."""
 
 
 def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> PairTable:
@@ -78,7 +80,7 @@ def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> P
         kinds = _kinds(model, *pair)
         meshes = tuple(int(model.geom_dataid[g]) if k == "mesh" else -1 for g, k in zip(pair, kinds, strict=True))
         found.setdefault((kinds, meshes), []).append(pair)
-    groups, link, mu, margin = [], [], [], []
+    groups, link, mu, margin, torsional = [], [], [], [], []
     used = np.unique([pair for pairs in found.values() for pair in pairs])
     for (kinds, meshes), pairs in found.items():
         geoms = np.array(pairs)
@@ -89,7 +91,8 @@ def pair_table(model: mujoco.MjModel, hand: np.ndarray, object: np.ndarray) -> P
         link.append(np.tile(model.geom_bodyid[geoms[:, 0]], count))
         mu.append(np.tile([known[pair].friction for pair in pairs], count))
         margin.append(np.tile([known[pair].margin for pair in pairs], count))
-    slots_of = [np.concatenate(parts) for parts in (link, mu, margin)]
+        torsional.append(np.tile([known[pair].torsional for pair in pairs], count))
+    slots_of = [np.concatenate(parts) for parts in (link, mu, margin, torsional)]
     return PairTable(tuple(groups), used, model.geom_size[used], *slots_of)
 
 

@@ -34,6 +34,8 @@ class ForceClosure:
     """See `min_weight`."""
     status: Int[Array, "*batch"]
     """SOLVED, INVALID_INPUT, or MAX_ITERATIONS where the program could not be solved and nothing is proved."""
+    internal_moments: Float[Array, "*batch contacts"] | None = None
+    """The moments about the normals that come with `internal_forces`, N m; None for hard contacts."""
 
 
 @metric
@@ -100,6 +102,10 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     weights = jnp.where(edges.counted & closed[..., None], dual.z + least[..., None], 0)
     weights = safe_divide(weights, weights.sum(-1, keepdims=True)).reshape(edges.wrenches.shape[:-1])
     forces = jnp.einsum("...ce,...cea->...ca", weights, edges.forces)
+    moments = None
+    if contacts.torsional_arms is not None:
+        moments = forces[..., 3] * jnp.where(edges.present, contacts.torsional_arms, 0)
+        moments = jnp.where(closed[..., None], moments, jnp.nan)
     # A twist along which every edge does negative work; where they do not span the space, one along which they do none.
     twist = jnp.where(~spans[..., None], directions[..., -1], dual.x[..., :6])
     twist = safe_divide(twist, jnp.max(jnp.abs(twist), -1, keepdims=True))
@@ -107,10 +113,11 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     status = jnp.where(known, int(Status.SOLVED), int(Status.MAX_ITERATIONS))
     return ForceClosure(
         closed=closed,
-        internal_forces=jnp.where(closed[..., None, None], forces, jnp.nan),
+        internal_forces=jnp.where(closed[..., None, None], forces[..., :3], jnp.nan),
         separating_twist=jnp.where((known & ~closed)[..., None], turned, jnp.nan),
         min_weight=_above_rounding(edges, least, spans),
         status=jnp.where(edges.valid, status, int(Status.INVALID_INPUT)),
+        internal_moments=moments,
     )
 
 

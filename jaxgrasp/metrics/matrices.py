@@ -81,8 +81,8 @@ def closure_residual(contacts: Contacts, space: WrenchSpace | None = None) -> Fl
 
 
 def _extreme(blocks: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The sixth and the first singular value of G from blocks (*batch, n_c, 6, 3)."""
-    G = jnp.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], 6, 3 * blocks.shape[-3])
+    """The sixth and the first singular value of G from blocks (*batch, n_c, 6, k)."""
+    G = jnp.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], 6, blocks.shape[-1] * blocks.shape[-3])
     # The derivative of a singular value is that of |G'u| with its own u held.
     u = linalg.right_singular(jnp.swapaxes(G, -1, -2))[1]
     length = lambda column: safe_norm(jnp.einsum("...ij,...i->...j", G, column))

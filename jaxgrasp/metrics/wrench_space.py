@@ -30,7 +30,8 @@ class WrenchSpace:
     """
 
     cone_edges: int = field(default=8, metadata={"static": True})
-    """n_e, edges of each pyramid, at angles 2 pi k / n_e from t1 on Coulomb's cone."""
+    """n_e, edges of each pyramid, at angles 2 pi k / n_e from t1 on Coulomb's cone; a soft contact has two more,
+    of pure torsion +-gamma about its normal."""
     unit_edges: bool = field(default=False, metadata={"static": True})
     """Edges have norm 1 (as in FRoGGeR); else their normal component is 1 (as Ferrari and Canny have it)."""
     length: ArrayLike | None = None
@@ -44,17 +45,21 @@ class Edges(NamedTuple):
     """Wrenches of all edges, harmless where they cannot be used."""
 
     wrenches: jax.Array
-    """(*batch, n_c, n_e, 6), force and moment / length of a finger that pushes along the edge; zero where absent."""
+    """(*batch, n_c, n_e, 6), force and moment / length of a finger that pushes along the edge; zero where absent. Of
+    soft contacts (*batch, n_c, n_e + 2, 6)."""
     present: jax.Array
     """(*batch, n_c), bool."""
     valid: jax.Array
     """(*batch,), bool; other grasps have no contact present."""
     grasp_map: jax.Array
-    """(*batch, n_c, 6, 3), blocks of G, moments / length; zero where absent."""
+    """(*batch, n_c, 6, k), blocks of G, moments / length; zero where absent. k = 3, or 4 with a column for the moment m
+    as the force m mu / gamma."""
     length: jax.Array
     """(*batch,), m."""
     forces: jax.Array
-    """(*batch, n_c, n_e, 3), the edges in contact frames."""
+    """(*batch, n_c, n_e, k), the edges in contact frames."""
+    soft: jax.Array | None
+    """(*batch, n_c), bool, which contacts bear moments; the last two edges of others do not count. None: hard ones."""
 
     @property
     def flat(self) -> jax.Array:
@@ -65,7 +70,11 @@ class Edges(NamedTuple):
     @property
     def counted(self) -> jax.Array:
         """(*batch, n_c n_e), which of the flat ones are there."""
-        return jnp.repeat(self.present, self.wrenches.shape[-2], -1)
+        if self.soft is None:
+            return jnp.repeat(self.present, self.wrenches.shape[-2], -1)
+        poles = jnp.stack([self.present & self.soft] * 2, -1)
+        pyramid = jnp.stack([self.present] * (self.wrenches.shape[-2] - 2), -1)
+        return jnp.concatenate([pyramid, poles], -1).reshape(*self.valid.shape, -1)
 
 
 @own_settings()
@@ -77,8 +86,9 @@ def edge_wrenches(contacts: Contacts, space: WrenchSpace | None = None) -> Float
         space: conventions; `WrenchSpace()` where None.
 
     Returns:
-        (*batch, n_c, n_e, 6), forces as multiples of the normal force (or of the whole, with `unit_edges`) and moments
-        divided by the length; zero for absent contacts, NaN for grasps whose data are not admissible.
+        (*batch, n_c, n_e, 6), of soft contacts (*batch, n_c, n_e + 2, 6), forces as multiples of the normal force (or
+        of the whole, with `unit_edges`) and moments divided by the length; zero for absent contacts, NaN for grasps
+        whose data are not admissible.
 
     Raises:
         ValueError: options or shapes that do not fit.
@@ -139,15 +149,28 @@ def _edges(contacts: Contacts, space: WrenchSpace) -> Edges:
         length = jnp.where(length > 0, length, 1)
     moments = jnp.cross(arms[..., None, :], jnp.swapaxes(frames, -1, -2)) / length[..., None, None, None]
     blocks = jnp.concatenate([frames, jnp.swapaxes(moments, -1, -2)], -2)
+    soft = None
+    if contacts.torsional_friction is not None:
+        assert contacts.torsional_arms is not None
+        lever = jnp.where(present, contacts.torsional_arms, 0) / length[..., None]
+        soft = lever > 0
+        turn = lever[..., None] * frames[..., 2]
+        blocks = jnp.concatenate([blocks, jnp.concatenate([0 * turn, turn], -1)[..., None]], -1)
     angles = 2 * math.pi * np.arange(space.cone_edges) / space.cone_edges
     circle = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), dtype)
     tangential = friction[..., None, None] * circle
     forces = jnp.concatenate([tangential, -jnp.ones_like(tangential[..., :1])], -1)
+    if soft is not None:
+        twist = jnp.where(soft, friction, 0)[..., None, None] * jnp.array([[1.0], [-1.0]], dtype)
+        push = jnp.where(soft, -1.0, 0.0).astype(dtype)[..., None, None] * jnp.array([[0.0, 0, 1]], dtype)
+        poles = jnp.concatenate([jnp.broadcast_to(push, (*twist.shape[:-1], 3)), twist], -1)
+        forces = jnp.concatenate([forces, jnp.zeros_like(forces[..., :1])], -1)
+        forces = jnp.concatenate([forces, poles], -2)
     if space.unit_edges:
         forces = forces / jnp.sqrt(1 + friction * friction)[..., None, None]
     blocks = jnp.where(present[..., None, None], blocks, 0)
     wrenches = jnp.einsum("...cra,...cea->...cer", blocks, forces)
-    return Edges(wrenches, present, valid, blocks, length, forces)
+    return Edges(wrenches, present, valid, blocks, length, forces, soft)
 
 
 def hidden(edges: Edges, value: jax.Array) -> jax.Array:
@@ -195,4 +218,6 @@ def _sound(contacts: Contacts) -> jax.Array:
     lanes = jnp.moveaxis(contacts.frames, (-3, -2, -1), (0, 1, 2))
     sound = jnp.isfinite(contacts.positions).all(-1) & jnp.moveaxis(rotations(lanes), 0, -1)
     sound &= (contacts.friction >= 0) & jnp.isfinite(contacts.friction)
+    if contacts.torsional_friction is not None:
+        sound &= (contacts.torsional_friction >= 0) & jnp.isfinite(contacts.torsional_friction)
     return sound & (contacts.max_force > 0) & jnp.isfinite(contacts.max_force)

@@ -66,7 +66,7 @@ def candidates_of(
         found |= {
             name: np.broadcast_to(x[:1], (count, *x.shape[1:])) for name, x in found.items() if name in _TRANSMISSION
         }
-    contacts = {name: found.pop(name) for name in _CONTACTS}
+    contacts = {name: found.pop(name) for name in _CONTACTS if name in found}
     own = {name: found.pop(name) for name in ("touching", "left_out", "penetration")} | {"qpos": qpos}
     return Candidates(
         **contacts,
@@ -97,7 +97,8 @@ def trimmed(candidates: Candidates) -> Candidates:
     most = int(candidates.active.sum(-1).max(initial=1))
     count = min(candidates.num_contacts, -(-most // 4) * 4)
     # Contacts of hands come in order, those that touch first.
-    own = {name: getattr(candidates, name)[:, :count] for name in _CONTACTS}
+    own = {name: getattr(candidates, name) for name in _CONTACTS}
+    own = {name: None if column is None else column[:, :count] for name, column in own.items()}
     if "jacobian" in candidates.hand:
         own["hand"] = candidates.hand | {"jacobian": candidates.hand["jacobian"][:, :count]}
     return replace(candidates, **own)

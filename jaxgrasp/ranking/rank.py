@@ -57,6 +57,9 @@ class Ranking:
     metrics: dict[str, Float[np.ndarray, " batch"]] = field(default_factory=dict)
     """Other metrics by name, that which ranks first."""
 
+    moments: Float[np.ndarray, "top contacts"] | None = None
+    """The moments about the normals that come with the forces, N m; None for hard contacts."""
+
     @property
     def rank(self) -> Int[np.ndarray, " batch"]:
         """The rank of each candidate; 1 is the best."""
@@ -241,8 +244,11 @@ class _Scores:
             np.empty((0, candidates.num_contacts, 3)),
             candidates.hand.get("idle_controls", np.empty((0, 0))),
         )
-        answers = [(empty, empty, np.empty(0), np.empty(0, dtype=int), actuators[:0]), *answers]
-        forces, object_forces, effort, tightening_status, controls = map(np.concatenate, zip(*answers, strict=True))
+        hard = candidates.torsional_friction is None
+        first = empty, empty, empty[..., 0][:, :0] if hard else empty[..., 0]
+        answers = [(*first, np.empty(0), np.empty(0, dtype=int), actuators[:0]), *answers]
+        found = map(np.concatenate, zip(*answers, strict=True))
+        forces, object_forces, moments, effort, tightening_status, controls = found
         return Ranking(
             candidates=candidates.take(slice(self.done)),
             margin=self.margin[: self.done],
@@ -252,6 +258,7 @@ class _Scores:
             share=share,
             forces=forces + 0.0,
             object_forces=object_forces + 0.0,
+            moments=None if hard else moments + 0.0,
             effort=effort,
             tightening_status=tightening_status,
             controls=controls,

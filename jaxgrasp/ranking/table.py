@@ -28,8 +28,9 @@ def ranking_table(ranking: Ranking, ranks: slice = slice(None)) -> dict[str, np.
     Returns:
         Arrays with a leading axis of N by name: rank; source and index, the file and the row in it; margin and
         upper_bound, multiples of the disturbance set; status; other metrics that were asked for; effort, N^2, and
-        forces (N, n_c, 3), N, on the object in its frame, NaN for all but the best, like the controls (N, n_u) of a
-        hand; mass where any is known; and what travelled along, with `input_` before a name that the table has itself.
+        forces (N, n_c, 3), N, on the object in its frame, NaN for all but the best, like the moments (N, n_c) of soft
+        contacts, N m, about their normals, and the controls (N, n_u) of a hand; mass where any is known; and what
+        travelled along, with `input_` before a name that the table has itself.
     """
     table = _columns(ranking, ranks)
     return table | {name: names[table[name]] for name, names in _names(ranking).items()}
@@ -63,6 +64,10 @@ def _columns(ranking: Ranking, ranks: slice) -> dict[str, np.ndarray]:
         "effort": effort,
         "forces": forces,
     }
+    if ranking.moments is not None:
+        moments = np.full((len(order), candidates.num_contacts), np.nan)
+        moments[: len(answers)] = ranking.moments[answers]
+        table["moments"] = moments
     if ranking.controls.shape[-1]:
         controls = np.full((len(order), ranking.controls.shape[-1]), np.nan)
         controls[: len(answers)] = ranking.controls[answers]

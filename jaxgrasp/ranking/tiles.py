@@ -43,6 +43,8 @@ def columns_of(candidates: Candidates) -> Columns:
     }
     if candidates.frames is not None:
         columns["frames"] = candidates.frames
+    if candidates.torsional_friction is not None:
+        columns["torsional_friction"] = candidates.torsional_friction
     if candidates.outward_normals is not None:
         columns["outward_normals"] = candidates.outward_normals
     return columns | candidates.hand
@@ -57,6 +59,7 @@ def contacts_of(columns: Columns) -> Contacts:
         friction=columns["friction"],
         max_force=columns["max_force"],
         active=columns["active"],
+        torsional_friction=columns.get("torsional_friction"),
     )
 
 
@@ -122,8 +125,8 @@ def tightening(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str,
     """Solves (22) at the margins of the column `wanted`.
 
     Returns:
-        Forces in contact and in object frames, effort, status, and the commands of a hand's actuators, of which there
-        may be none.
+        Forces in contact and in object frames, moments about the normals (without a contact where all are hard),
+        effort, status, and the commands of a hand's actuators, of which there may be none.
     """
     solution = least_effort(contacts, disturbances, columns["wanted"], **task)
     controls = jnp.zeros((len(solution.effort), 0), solution.effort.dtype)
@@ -131,7 +134,9 @@ def tightening(contacts: Contacts, disturbances: DisturbanceSet, task: dict[str,
         assert solution.actuator_efforts is not None
         own = solution.actuator_efforts[:, : columns["idle_controls"].shape[-1]]
         controls = columns["idle_controls"] + columns["controls_per_effort"] * own
-    return solution.forces, solution.forces_in_object_frame(contacts), solution.effort, solution.status, controls
+    moments = controls[:, :0] if solution.moments is None else solution.moments
+    turned = solution.forces_in_object_frame(contacts)
+    return solution.forces, turned, moments, solution.effort, solution.status, controls
 
 
 def _few(columns: Columns) -> bool:

@@ -24,7 +24,7 @@ class Actuated(NamedTuple):
     """`Actuation` in lanes (trailing; some leaves may be shared, with lanes of size 1)."""
 
     joints: jax.Array
-    """(n_v, 3, n, *lanes), J' divided by the length unit of `Grasps`; zero for absent contacts."""
+    """(n_v, k, n, *lanes), J' divided by the length unit of `Grasps`; zero for absent contacts."""
     transmission: jax.Array
     """(n_v, n_u, *lanes), B divided by the length unit."""
     inverse: jax.Array
@@ -76,7 +76,7 @@ def clip_limits(actuated: Actuated, friction: jax.Array, max_force: jax.Array) -
 
     With |f_t| <= mu f_max and |f_n| <= f_max in every contact, no actuator effort needs to be larger.
     """
-    reach = jnp.stack([friction, friction, jnp.ones_like(friction)]) * max_force
+    reach = jnp.stack([friction, friction, jnp.ones_like(friction), friction][: actuated.joints.shape[1]]) * max_force
     torque = _torques(jnp.abs(actuated.joints), reach)
     needed = _times(jnp.abs(actuated.inverse), torque)
     # Where actuators oppose each other, one may have to make up for all the others.
@@ -90,7 +90,7 @@ def clip_limits(actuated: Actuated, friction: jax.Array, max_force: jax.Array) -
 
 
 def stack_rows(columns: jax.Array, actuated: Actuated | None) -> jax.Array:
-    """Stack G (6, 3, n, *lanes) and N'J' where actuators do not reach every joint direction."""
+    """Stack G (6, k, n, *lanes) and N'J' where actuators do not reach every joint direction."""
     if actuated is None or actuated.unreached is None:
         return columns
     torqueless = _times(actuated.unreached, actuated.joints)
@@ -98,7 +98,7 @@ def stack_rows(columns: jax.Array, actuated: Actuated | None) -> jax.Array:
 
 
 def actuator_reach(actuated: Actuated, inverse: jax.Array, units: jax.Array) -> jax.Array:
-    """The wrenches -A G*, then A G*, of the limits' rows: (6, 2, n_u, *lanes) from G* (3, 6, n, *lanes)."""
+    """The wrenches -A G*, then A G*, of the limits' rows: (6, 2, n_u, *lanes) from G* (k, 6, n, *lanes)."""
 
     @fenced
     def spread(inverse: jax.Array) -> jax.Array:
@@ -113,7 +113,7 @@ def actuator_reach(actuated: Actuated, inverse: jax.Array, units: jax.Array) -> 
 
 
 def _torques(joints: jax.Array, forces: jax.Array) -> jax.Array:
-    """J'f (n_v, *lanes) from (n_v, 3, n, *lanes) and (3, n, *lanes). Spelt out: a product would be a library call."""
+    """J'f (n_v, *lanes) from (n_v, k, n, *lanes) and (k, n, *lanes). Spelt out: a product would be a library call."""
     return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(joints * forces, 1, 0)), 1, 0))
 
 
@@ -127,7 +127,7 @@ def _times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 class JoinedRows(NamedTuple):
     """The equality rows of contact forces and actuator efforts together, before they are made orthonormal.
 
-    forces: (6 + n_v, 3, n, *lanes), of G f = b and J'f - B u = 0 for scaled forces.
+    forces: (6 + n_v, k, n, *lanes), of G f = b and J'f - B u = 0 for scaled forces.
     actuators: (6 + n_v, 1, n_u, *lanes).
     sizes: (n_v, *lanes), what the joints' rows were divided by.
     """
@@ -142,8 +142,8 @@ def join_rows(actuated: Actuated, columns: jax.Array, scales: jax.Array, unit: j
 
     Args:
         actuated: the hand.
-        columns: (6, 3, n, *lanes), those of G for scaled forces.
-        scales: (3, n, *lanes), the units of the forces.
+        columns: (6, k, n, *lanes), those of G for scaled forces.
+        scales: (k, n, *lanes), the units of the forces.
         unit: (n_u, *lanes), the units of the actuator efforts.
     """
     torque = actuated.joints * scales
@@ -160,16 +160,16 @@ def join_rows(actuated: Actuated, columns: jax.Array, scales: jax.Array, unit: j
 
 
 def pack(rows: JoinedRows) -> jax.Array:
-    """Write both kinds of unknown as blocks of three, (eq, 3, n + ceil(n_u / 3), *lanes), for `whitened`."""
-    columns = rows.actuators[:, 0]
-    spare = -columns.shape[1] % 3
+    """Write both kinds of unknown as blocks of k, (eq, k, n + ceil(n_u / k), *lanes), for `whitened`."""
+    columns, size = rows.actuators[:, 0], rows.forces.shape[1]
+    spare = -columns.shape[1] % size
     padded = jnp.concatenate([columns, jnp.zeros((columns.shape[0], spare, *columns.shape[2:]), columns.dtype)], 1)
-    blocks = padded.reshape(padded.shape[0], -1, 3, *padded.shape[2:])
+    blocks = padded.reshape(padded.shape[0], -1, size, *padded.shape[2:])
     return jnp.concatenate([rows.forces, jnp.moveaxis(blocks, 2, 1)], 2)
 
 
 def unpack(rows: jax.Array, contacts: int, actuators: int) -> tuple[jax.Array, jax.Array]:
-    """Take the columns of forces (eq, 3, n, *lanes) and of actuators (eq, 1, n_u, *lanes) out of packed rows."""
+    """Take the columns of forces (eq, k, n, *lanes) and of actuators (eq, 1, n_u, *lanes) out of packed rows."""
     blocks = jnp.moveaxis(rows[:, :, contacts:], 1, 2)
     columns = blocks.reshape(rows.shape[0], -1, *rows.shape[3:])[:, :actuators]
     return rows[:, :, :contacts], columns[:, None]

@@ -32,13 +32,16 @@ def blocking_forces(
         compliance: Q, as in `largest_disturbance`; one each with `Compliance.per_direction`.
 
     Returns:
-        (*batch, n_d, n_c, 3), N, contact frames; 0 for absent contacts, NaN where the data are not admissible.
+        (*batch, n_d, n_c, 3), N, contact frames; 0 for absent contacts, NaN where the data are not admissible. Of soft
+        contacts (*batch, n_d, n_c, 4), the fourth the moment about the normal, N m.
 
     Raises:
         ValueError: shapes that do not fit.
     """
     data = GraspData.from_arguments(contacts, DisturbanceSet.vertices(wrenches), compliance=compliance)
-    return over_grasps(_BlockingForces(), data)
+    found = over_grasps(_BlockingForces(), data)
+    units = _units(contacts)
+    return found if units is None else found * units[..., None, :, :]
 
 
 def weighted_pseudo_inverse(
@@ -49,12 +52,14 @@ def weighted_pseudo_inverse(
     G* W are the contact forces that supply the wrench W with the least f' Q f; contacts without friction have normal
     forces alone, so their tangents have no columns in G and Q here and rows of 0 in G*. On a rank-deficient grasp that
     holds for wrenches in the range of G; of others G* takes the part in the range, projected with moments in units of
-    the root-mean-square distance of the contacts from the centre of mass.
+    the root-mean-square distance of the contacts from the centre of mass. Soft contacts have four rows each, the fourth
+    for the moment about the normal, N m.
 
     Args:
         contacts: the grasps.
         compliance: Q of (14), contact frames: None for the identity, (*batch, n_c, 3, 3) blocks by contact or
-            (*batch, 3 n_c, 3 n_c) full, symmetric positive definite; n_d of them with `Compliance.per_direction`.
+            (*batch, 3 n_c, 3 n_c) full, symmetric positive definite; n_d of them with `Compliance.per_direction`. For
+            soft contacts 4 in place of 3, see `largest_disturbance`.
 
     Returns:
         (*batch, 3 n_c, 6), contact by contact in contact frames, from N and N m in the object frame to N; (*batch, n_d,
@@ -70,10 +75,22 @@ def weighted_pseudo_inverse(
     if isinstance(compliance, Compliance):
         # Blocks have an axis more than full matrices, which are larger than 3 by 3 but for single contacts.
         shape = compliance.per_vertex.shape
-        still = np.zeros((shape[-4 if len(shape) > 3 and shape[-1] == 3 else -3], 6))
+        still = np.zeros((shape[-4 if len(shape) > 3 and shape[-1] == contacts.components else -3], 6))
     data = GraspData.from_arguments(contacts, DisturbanceSet.vertices(still), compliance=compliance)
     found = over_grasps(_PseudoInverse(), data)
+    units = _units(contacts)
+    if units is not None:
+        units = units[..., None, :, :] if isinstance(compliance, Compliance) else units
+        found = found * units[..., None]
     return found.reshape(*found.shape[:-3], -1, 6)
+
+
+def _units(contacts: Contacts) -> jax.Array | None:
+    """What turns the components of soft contacts from newtons to N and N m, (*batch, n_c, 4); None for hard ones."""
+    if contacts.torsional_arms is None:
+        return None
+    arms = jnp.where(contacts.active, contacts.torsional_arms, 0)[..., None]
+    return jnp.concatenate([jnp.ones((*arms.shape[:-1], 3), arms.dtype), arms], -1)
 
 
 @dataclass(frozen=True)
@@ -81,7 +98,7 @@ class _PseudoInverse(Plain):
     rows = 18
 
     def evaluate(self, grasps: Grasps) -> jax.Array:
-        # (3, 6, n, *lanes) to (n, 3, 6, *lanes); its columns take newtons alone.
+        # (k, 6, n, *lanes) to (n, k, 6, *lanes); its columns take newtons alone.
         blocks = lambda root: jnp.moveaxis(pseudo_inverse(grasps.columns, root)[0], 2, 0) * grasps.units
         if grasps.vertex_inverse_roots is None:
             inverses = blocks(grasps.inverse_root)

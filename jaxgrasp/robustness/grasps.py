@@ -41,6 +41,8 @@ class Grasps:
     """(n, *lanes), 1 where a contact is there, else 0."""
     rough: jax.Array
     """(n, *lanes), 1 where a contact that is there has friction, else 0; see `admit` for those that have none."""
+    turning: jax.Array | None
+    """(n, *lanes), 1 where a contact bears a moment about its normal, else 0; None for hard contacts."""
     friction: jax.Array
     """(n, *lanes); 1 where there is none."""
     max_force: jax.Array
@@ -50,7 +52,8 @@ class Grasps:
     units: jax.Array
     """(6, *lanes), what turns wrenches in N and N m to newtons: 1 and 1 / length."""
     columns: jax.Array
-    """(6, 3, n, *lanes), the blocks of G; zero where absent, and for tangents of contacts without friction."""
+    """(6, k, n, *lanes), the blocks of G; zero where absent, and for tangents of contacts without friction. k = 3, or 4
+    for soft contacts, whose moments are in newtons, see `Contacts.torsional_arms`."""
     lined: jax.Array
     """bool (*lanes), all contacts are on one line, exactly: two of them always are. G has rank 5 at most."""
     wrench: jax.Array
@@ -70,7 +73,7 @@ class Grasps:
     vertex_inverse_roots: jax.Array | None
     """M for each vertex of the disturbance set, along the leading axis."""
     weight_roots: jax.Array | None
-    """R with R'R = Q_0, (3, 3, n, *lanes) for blocks or (3 n, 3 n, *lanes) for a full Q_0; None for Q_0 = I."""
+    """R with R'R = Q_0, (k, k, n, *lanes) for blocks or (k n, k n, *lanes) for a full Q_0; None for Q_0 = I."""
     options: Options
     """The options of the call, lanes trailing, made safe as well."""
     actuated: Actuated | None
@@ -78,12 +81,13 @@ class Grasps:
 
     @property
     def transmits(self) -> jax.Array:
-        """(3, n, *lanes), 1 where a contact transmits force along t1, t2 and n, else 0."""
-        return jnp.stack([self.rough, self.rough, self.present])
+        """(k, n, *lanes), 1 where a contact transmits force along t1, t2 and n, and a moment about n, else 0."""
+        turning = [] if self.turning is None else [self.turning]
+        return jnp.stack([self.rough, self.rough, self.present, *turning])
 
     @property
     def rows(self) -> jax.Array:
-        """(6 + r, 3, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
+        """(6 + r, k, n, *lanes), the blocks of G, and of N'J' where actuators do not reach every joint direction."""
         return stack_rows(self.columns, self.actuated)
 
     @property
@@ -136,12 +140,13 @@ def _run(function: BatchedFunction, data: GraspData, options: Options) -> Any:
     arguments = lay_out(data, options)
     # Roots of Q take loops over columns, which compact tiles do without.
     compact = function.tile is None and data.compliance is None and options.effort_weights is None
-    n = data.contacts.n_c
-    rows = n * (function.rows + 1)
+    n, components = data.contacts.n_c, data.contacts.components
+    # Soft contacts have twice as many facets.
+    rows = n * (function.rows * (components - 2) + 1)
     if data.actuation is not None:
         # The equality rows are what is largest; up to twice as many values were seen to compile.
         joints, actuators = data.actuation.transmission.shape[-2:]
-        rows = max(rows, math.ceil((6 + joints) * (3 * n + actuators) * TILE / 12_000))
+        rows = max(rows, math.ceil((6 + joints) * (components * n + actuators) * TILE / 12_000))
     lanes = Lanes(admit, arguments.shared, rows, compact, function.tile or LOOSE_TILE)
     out = differentiable(function, lanes, arguments.inputs)
     return jax.tree.map(lambda x: x.reshape(*arguments.batch, *x.shape[1:]), out)
@@ -166,7 +171,10 @@ def admit(inputs: Inputs) -> Grasps:
     assert load is not None
     valid = _usable_contacts(contacts)
     rough = active & (contacts.friction > 0)
-    transmits = jnp.stack([rough, rough, jnp.broadcast_to(active, rough.shape)], 1)
+    arms = contacts.torsional_arms
+    turning = None if arms is None else active & (arms > 0)
+    parts = [rough, rough, jnp.broadcast_to(active, rough.shape)]
+    transmits = jnp.stack(parts if turning is None else [*parts, turning], 1)
     compliance, root, vertex_roots, usable = _roots_of_compliance(data.compliance, transmits)
     valid &= usable
     weights, weight_roots, usable = _roots_of_weights(inputs.options.effort_weights, transmits, valid)
@@ -190,6 +198,10 @@ def admit(inputs: Inputs) -> Grasps:
     units = jnp.stack([jnp.ones_like(length)] * 3 + [1 / length] * 3)
     wrench = jnp.where(valid, load, 0)
     friction, max_force = jnp.where(rough, contacts.friction, 1), jnp.where(present, contacts.max_force, 1)
+    lined = _lined(positions, present)
+    if arms is not None:
+        lined &= (jnp.where(present, arms, 0) == 0).all(0)
+        arms = jnp.where(present, arms, 0) / length
     actuated = None
     if data.actuation is not None:
         actuated = _admit_actuation(data.actuation, transmits & valid, valid, length)
@@ -198,12 +210,13 @@ def admit(inputs: Inputs) -> Grasps:
         valid=valid,
         present=present.astype(positions.dtype),
         rough=rough.astype(positions.dtype),
+        turning=None if turning is None else (turning & valid).astype(positions.dtype),
         friction=friction,
         max_force=max_force,
         length=length,
         units=units,
-        columns=grasp_columns(positions / length, frames),
-        lined=_lined(positions, present),
+        columns=grasp_columns(positions / length, frames, arms),
+        lined=lined,
         wrench=wrench * units,
         reserve=None if data.cone_margin is None else _admit_reserve(data.cone_margin, present, valid),
         terms=data.disturbances.terms,
@@ -222,6 +235,8 @@ def _usable_contacts(contacts: Contacts) -> jax.Array:
     usable = jnp.isfinite(contacts.positions).all(1) & rotations(contacts.frames)
     usable &= (contacts.friction >= 0) & jnp.isfinite(contacts.friction)
     usable &= (contacts.max_force > 0) & jnp.isfinite(contacts.max_force)
+    if contacts.torsional_friction is not None:
+        usable &= (contacts.torsional_friction >= 0) & jnp.isfinite(contacts.torsional_friction)
     return (usable | ~contacts.active).all(0)
 
 
@@ -351,8 +366,8 @@ def _masked(matrices: jax.Array | None, transmits: jax.Array) -> jax.Array | Non
     """Blocks or full matrices of contacts with the identity's rows and columns for forces that are not transmitted.
 
     Args:
-        matrices: (n, 3, 3, *lanes) or (3 n, 3 n, *lanes).
-        transmits: bool (n, 3, *lanes).
+        matrices: (n, k, k, *lanes) or (k n, k n, *lanes).
+        transmits: bool (n, k, *lanes).
     """
     if matrices is None:
         return None

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jaxgrasp.arrays import fold, literal, safe_divide
 from jaxgrasp.contact.compliance import Compliance, pseudo_inverse, pseudo_inverse_adjoint
 from jaxgrasp.contact.contacts import Contacts
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.friction import contact_facets, pyramid_facets
 from jaxgrasp.contact.row_space import Basis
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.sets import furthest, support
@@ -47,8 +47,8 @@ def worst_case(
         cone_edges: n_e.
 
     Returns:
-        S_1 <= 0 (*batch, n_c, n_e), N, and S_2 >= 0 (*batch, n_c), N; zero for absent contacts, NaN where the data are
-        not admissible.
+        S_1 <= 0 (*batch, n_c, n_e), 2 n_e of soft contacts, N, and S_2 >= 0 (*batch, n_c), N; zero for absent contacts,
+        NaN where the data are not admissible.
 
     Raises:
         ValueError: shapes or options that do not fit.
@@ -68,7 +68,7 @@ class _WorstCase(OfPyramids, Plain):
 class RowLosses(NamedTuple):
     """The amount that the worst unit disturbance takes from every row.
 
-    cone: (n_e, n, *lanes), -S_1, N.
+    cone: (n_e, n, *lanes), -S_1, N; 2 n_e of soft contacts.
     bound: (n, *lanes), S_2, N.
     actuators: (2, n_u, *lanes), of u <= u_max and -u <= -u_min; None without actuators.
     basis: of the rows of G, and of N'J'.
@@ -100,7 +100,7 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> RowLosses:
             return tuple(jnp.maximum(r, p) for r, p in zip(reach, pulls, strict=True)), None
 
         lanes = grasps.length.shape
-        shapes = [(cone_edges + 1, *grasps.present.shape)]
+        shapes = [(cone_edges * (grasps.columns.shape[1] - 2) + 1, *grasps.present.shape)]
         if grasps.actuated is not None:
             shapes.append((2, grasps.actuated.transmission.shape[1], *lanes))
         none = tuple(jnp.zeros(shape, grasps.present.dtype) for shape in shapes)
@@ -111,16 +111,18 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> RowLosses:
 
 
 def _directions(inverse: jax.Array, friction: jax.Array, units: jax.Array, cone_edges: int) -> jax.Array:
-    """The wrenches -(C G*) of all facet rows, then E G*: (6, n_e + 1, n, *lanes) from G* (3, 6 or more, n, *lanes)."""
+    """The wrenches -(C G*) of all facet rows, then E G*: (6, rows, n, *lanes) from G* (k, 6 or more, n, *lanes)."""
 
     @fenced
     def spread(inverse: jax.Array, friction: jax.Array, units: jax.Array) -> jax.Array:
-        c, s, k = literal(-pyramid_facets(cone_edges).T, inverse.dtype)[..., None, None]
+        c, s, k, *pole = literal(-contact_facets(cone_edges, len(inverse)).T, inverse.dtype)[..., None, None]
 
         def component(each_wrench: tuple) -> jax.Array:
             inverse, unit = each_wrench
             cone = c * inverse[0] + s * inverse[1] + (k * friction) * inverse[2]
-            return jnp.concatenate([cone, inverse[2:]]) * unit
+            if pole:
+                cone = cone + pole[0] * inverse[3]
+            return jnp.concatenate([cone, inverse[2:3]]) * unit
 
         return each(component, (jnp.moveaxis(inverse[:, :6], 1, 0), units))
 
@@ -137,7 +139,7 @@ def reach_adjoint(
 
     Args:
         grasps: the grasps.
-        cone: (n_e, n, *lanes), cotangents of -S_1.
+        cone: (n_e, n, *lanes), cotangents of -S_1; 2 n_e of soft contacts.
         bound: (n, *lanes), of S_2.
         cone_edges: n_e.
         with_terms: whether the cotangents of the disturbance set are wanted.
@@ -164,7 +166,8 @@ def reach_adjoint(
 
     @fenced
     def gather(worst: jax.Array, weights: jax.Array, friction: jax.Array, units: jax.Array) -> tuple:
-        c, s, k = literal(pyramid_facets(cone_edges).T, weights.dtype)[..., None, None]
+        facets = contact_facets(cone_edges, len(inverse))
+        c, s, k, *pole = literal(facets.T, weights.dtype)[..., None, None]
 
         def component(each_wrench: tuple) -> tuple:
             worst, unit = each_wrench
@@ -172,11 +175,12 @@ def reach_adjoint(
             cone = pulled[:-1]
             along_normal = fold(jnp.add, cone * k)
             normal = pulled[-1] - friction * along_normal
-            return jnp.stack([-fold(jnp.add, cone * c), -fold(jnp.add, cone * s), normal]), along_normal
+            torsion = [-fold(jnp.add, cone * p) for p in pole]
+            return jnp.stack([-fold(jnp.add, cone * c), -fold(jnp.add, cone * s), normal, *torsion]), along_normal
 
         return each(component, (worst, units))
 
-    # (6, 3, n, *lanes), of the blocks of G*, and what comes with friction.
+    # (6, k, n, *lanes), of the blocks of G*, and what comes with friction.
     pulled, along_normal = gather(worst, weights, grasps.friction, grasps.units)
     friction = -fold(jnp.add, along_normal * inverse[2])
     columns, root = pseudo_inverse_adjoint(grasps.columns, grasps.inverse_root, pulled)

@@ -53,7 +53,7 @@ def trial_scene(course: Course | Hold, hand: mujoco.MjSpec, object: str, scale: 
 def hand_of(scene: Scene, **options) -> HandObject:
     """The hand and the object of a scene of a protocol; `options` are those of `HandObject.from_mjcf`.
 
-    That margins leave torsional friction out is no news where a protocol asks for it, and is not warned of.
+    That margins leave rolling friction out is no news where a protocol asks for it, and is not warned of.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="scene: contacts have condim")

@@ -5,6 +5,8 @@ with a matrix of its own, so that every elementary operation runs over all of th
 every single matrix.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -32,7 +34,7 @@ def matvec_transposed(matrix: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def sum_over_blocks(x: jax.Array) -> jax.Array:
-    """Sum (eq, 3, n, ...) over the components and the blocks, the axes 1 and 2: (eq, ...)."""
+    """Sum (eq, k, n, ...) over the components and the blocks, the axes 1 and 2: (eq, ...)."""
     return fold(jnp.add, jnp.moveaxis(fold(jnp.add, jnp.moveaxis(x, 1, 0)), 1, 0))
 
 
@@ -146,37 +148,63 @@ def orthonormalise(matrix: jax.Array) -> jax.Array:
     return repeat(size, remove, both)[rows:]
 
 
-def cholesky_3x3(entries: list[jax.Array]) -> list[jax.Array]:
-    """Factor symmetric positive definite 3x3 matrices; pivots are clamped at eps of the diagonal.
+class SmallFactor(NamedTuple):
+    """The Cholesky factor L of small matrices; lists of entries of any one shape."""
+
+    below: list[jax.Array]  # L10, L20, L21, ..
+    inverse: list[jax.Array]  # 1 / diag(L)
+
+
+def small_cholesky(entries: list[jax.Array]) -> SmallFactor:
+    """Factor symmetric positive definite matrices, written out; pivots are clamped at eps of the diagonal.
 
     Args:
-        entries: 00, 10, 11, 20, 21, 22 of the matrices, of any one shape.
-
-    Returns:
-        1/L00, L10, 1/L11, L20, L21, 1/L22 of the factor L.
+        entries: 00, 10, 11, 20, 21, 22, .. of the matrices, of any one shape.
     """
-    a00, a10, a11, a20, a21, a22 = entries
-    eps = jnp.finfo(a00.dtype).eps
-    pivot = lambda value, diagonal: lax.rsqrt(jnp.maximum(value, eps * diagonal))
-    i0 = pivot(a00, a00)
-    l10, l20 = a10 * i0, a20 * i0
-    i1 = pivot(a11 - l10 * l10, a11)
-    l21 = (a21 - l20 * l10) * i1
-    return [i0, l10, i1, l20, l21, pivot(a22 - l20 * l20 - l21 * l21, a22)]
+    eps = jnp.finfo(entries[0].dtype).eps
+    below: list[jax.Array] = []
+    inverse: list[jax.Array] = []
+    while entries:
+        i = len(inverse)
+        *row, diagonal = entries[: i + 1]
+        entries = entries[i + 1 :]
+        pivot = diagonal
+        for j in range(i):
+            for m in range(j):
+                row[j] = row[j] - row[m] * below[j * (j - 1) // 2 + m]
+            row[j] = row[j] * inverse[j]
+            pivot = pivot - row[j] * row[j]
+        below += row
+        inverse.append(lax.rsqrt(jnp.maximum(pivot, eps * diagonal)))
+    return SmallFactor(below, inverse)
 
 
-def solve_lower_3x3(factor: list[jax.Array], rhs: jax.Array) -> jax.Array:
-    """Compute L^-1 rhs with L from `cholesky_3x3`, for rhs (3, ...)."""
-    i0, l10, i1, l20, l21, i2 = factor
-    a = rhs[0] * i0
-    b = (rhs[1] - l10 * a) * i1
-    return jnp.stack([a, b, (rhs[2] - l20 * a - l21 * b) * i2])
+def substitute_down(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
+    """Compute L^-1 rhs; lists run over the unknowns, see `SmallFactor`."""
+    out: list[jax.Array] = []
+    for i, entry in enumerate(rhs):
+        for j in range(i):
+            entry = entry - below[i * (i - 1) // 2 + j] * out[j]
+        out.append(entry * inverse[i])
+    return out
 
 
-def solve_3x3(factor: list[jax.Array], rhs: jax.Array) -> jax.Array:
-    """Compute (L L')^-1 rhs with L from `cholesky_3x3`, for rhs (3, ...)."""
-    i0, l10, i1, l20, l21, i2 = factor
-    a, b, c = solve_lower_3x3(factor, rhs)
-    c = c * i2
-    b = (b - l21 * c) * i1
-    return jnp.stack([(a - l10 * b - l20 * c) * i0, b, c])
+def substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
+    """Compute L^-T rhs; lists run over the unknowns, see `SmallFactor`."""
+    out = list(rhs)
+    for i in reversed(range(len(rhs))):
+        for j in range(i + 1, len(rhs)):
+            out[i] = out[i] - below[j * (j - 1) // 2 + i] * out[j]
+        out[i] = out[i] * inverse[i]
+    return out
+
+
+def solve_lower(factor: SmallFactor, rhs: jax.Array) -> jax.Array:
+    """Compute L^-1 rhs for rhs (k, ...)."""
+    return jnp.stack(substitute_down(factor.below, factor.inverse, list(rhs)))
+
+
+def solve_small(factor: SmallFactor, rhs: jax.Array) -> jax.Array:
+    """Compute (L L')^-1 rhs for rhs (k, ...)."""
+    down = substitute_down(factor.below, factor.inverse, list(rhs))
+    return jnp.stack(substitute_up(factor.below, factor.inverse, down))

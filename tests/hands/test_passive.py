@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import jax
 import mujoco
 import numpy as np
@@ -228,6 +231,82 @@ def test_friction_and_dimension_are_combined_as_in_mujoco(pad, cube, rest, frict
 
 
 @pytest.mark.parametrize(
+    ("pad", "cube", "rest", "gamma"),
+    [
+        ('condim="4" friction="0.5 0.02 0"', 'friction="0.7 0.01 0"', "", 0.02),
+        ('condim="4" friction="0.5 0.02 0" priority="1"', 'friction="0.7 0.05 0"', "", 0.02),
+        ('condim="6"', 'friction="0.7 0.03 0"', "", 0.03),
+        ('condim="4"', 'friction="0.7 0.03 0" priority="1"', "", None),
+        ("", "", '<contact><pair geom1="g0" geom2="cube" condim="4" friction="0.2 0.2 0.04 0 0"/></contact>', 0.04),
+        (
+            'condim="4"',
+            "",
+            '<option o_friction="0.3 0.3 0.015 0 0"><flag override="enable"/></option>',
+            0.015,
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:scene. contacts have condim 6")
+def test_torsional_friction_is_combined_as_in_mujoco(pad, cube, rest, gamma):
+    model = mujoco.MjModel.from_xml_string(four_pads(pad=pad, cube=cube, rest=rest))
+    hand, data = HandObject.from_mjcf(model, "object"), mujoco.MjData(model)
+    qpos = closed(model)
+    qpos[: len(hand.joints)] += 1e-4
+    data.qpos = qpos
+    mujoco.mj_forward(model, data)
+    theirs = {min(model.geom_bodyid[c.geom].tolist()): c.friction[2] if c.dim > 3 else 0.0 for c in data.contact}
+    for engine in ("mujoco", "distance"):
+        grasps = hand.grasps(qpos, engine)
+        if gamma is None:
+            assert grasps.contacts.torsional_friction is None and grasps.actuation.jacobian.shape[-2] == 3
+            continue
+        found = np.asarray(grasps.contacts.torsional_friction).tolist()
+        ours = dict(zip(np.asarray(grasps.links).tolist(), found, strict=True))
+        assert ours == pytest.approx(theirs, rel=1e-6) and ours[1] == pytest.approx(gamma, rel=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "distance"])
+def test_joints_turn_soft_contacts_as_in_mujoco(engine):
+    """Fingers that turn about the normals at their tips, against MuJoCo's Jacobians; torques are those of both."""
+    hinge = r'\g<0><joint name="h\1" type="hinge" axis="1 2 3"/>'
+    xml = re.sub(r'<body name="f(\d)" [^>]*>', hinge, four_pads(pad='condim="4"', cube='friction="0.7 0.03 0"'))
+    model = mujoco.MjModel.from_xml_string(xml)
+    hand, data = HandObject.from_mjcf(model, "object"), mujoco.MjData(model)
+    qpos = model.qpos0.copy()
+    for k in range(4):
+        qpos[model.jnt_qposadr[model.joint(f"j{k}").id]] = 0.0201
+    grasps = hand.grasps(qpos, engine)
+    contacts = grasps.contacts
+    data.qpos = qpos
+    mujoco.mj_forward(model, data)
+    assert contacts.active.sum() == 4
+    whole = hand._mechanics.jacobians(
+        hand.engine("mujoco").find(qpos[None]),
+        np.asarray(grasps.object_position + contacts.positions @ grasps.object_rotation.T)[None],
+        hand.moved_bodies[np.asarray(grasps.links)][None],
+        np.asarray(contacts.frames)[None],
+        np.asarray(grasps.object_rotation)[None],
+        True,
+        np,
+    )[0]
+    turn = np.zeros((3, model.nv))
+    for row, link in enumerate(np.asarray(grasps.links).tolist()):
+        mujoco.mj_jacBody(model, data, None, turn, link)
+        normal = np.asarray(grasps.object_rotation @ contacts.frames[row, :, 2])
+        np.testing.assert_allclose(whole[row, 3], (normal @ turn)[hand.dofs], atol=1e-6)
+        assert np.abs(whole[row, 3]).max() > 0.1
+    load = grasps.required_wrench
+    moments = jg.DisturbanceSet.vertices(np.array([[0, 0, 0, 0.01, 0, 0], [0, 0, 0, -0.01, 0, 0]]))
+    soft = jg.largest_disturbance(contacts, moments, required_wrench=load, actuation=grasps.actuation)
+    assert soft.status == jg.Status.SOLVED and grasps.actuation.jacobian.shape[-2] == 4
+    torques = grasps.actuation.joint_torques(soft.forces, soft.moments)
+    np.testing.assert_allclose(torques, grasps.actuation.transmission @ soft.actuator_efforts, atol=1e-6)
+    with pytest.raises(ValueError, match=r"actuation: got a jacobian of shape \(4, 4, .*wanted \(\*batch, 4, 3, n_v\)"):
+        hard = replace(contacts, torsional_friction=None)
+        jg.largest_disturbance(hard, moments, actuation=grasps.actuation)
+
+
+@pytest.mark.parametrize(
     ("parts", "holds"),
     [
         ({}, True),
@@ -257,7 +336,7 @@ def test_margin_and_gap_say_how_far_contacts_push(engine):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"pad": 'condim="4"'}, "torsional and rolling friction is left out"),
+        ({"pad": 'condim="6"'}, "rolling friction is left out"),
         ({"rest": '<contact><pair geom1="g0" geom2="cube" friction="{}"/></contact>'}, "'g0' and 'cube'.* 0.2 and 0.4"),
         ({"rest": '<option o_friction="{}"><flag override="enable"/></option>'}, "0.2 and 0.4, of which the smaller"),
     ],

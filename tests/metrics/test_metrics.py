@@ -172,6 +172,50 @@ def test_singular_values_are_numpys():
     np.testing.assert_allclose(residual, np.linalg.norm(G[:, :, 2::3].sum(-1), axis=-1), atol=1e-12)
 
 
+def soft_and_hard() -> tuple[jg.Contacts, np.ndarray]:
+    """Grasps with some soft contacts, and their wrenches from the definition, (batch, n_c n_e + 2 n_c, 6)."""
+    contacts = random_contacts()
+    gamma = np.random.default_rng(0).uniform(0.005, 0.03, contacts.friction.shape)
+    gamma[:, ::2] = 0
+    contacts = replace(contacts, torsional_friction=jnp.asarray(gamma))
+    positions, normals = np.asarray(contacts.positions), np.asarray(contacts.frames)[..., 2]
+    length = np.sqrt((positions**2).sum(-1).mean(-1))[:, None, None]
+    poles = []
+    for sign in (1, -1):
+        moment = np.cross(positions, -normals) + sign * gamma[..., None] * normals
+        # Those of hard contacts do not count: zero.
+        poles.append(np.concatenate([-normals, moment / length], -1) * (gamma > 0)[..., None])
+    pyramid = edges(contacts)
+    return contacts, np.concatenate([pyramid, np.stack(poles, 2)], 2).reshape(len(gamma), -1, 6)
+
+
+def test_soft_contacts_have_edges_of_pure_torsion():
+    contacts, W = soft_and_hard()
+    ours = np.asarray(metrics.edge_wrenches(contacts, SPACE)).reshape(W.shape)
+    np.testing.assert_allclose(ours, W, atol=1e-12)
+    found = closure(contacts, SPACE)
+    tasks = np.asarray(task(contacts, TASK, SPACE))
+    length = np.sqrt((np.asarray(contacts.positions) ** 2).sum(-1).mean(-1))
+    wanted = np.asarray(TASK.terms[0].wrenches)[:-1]
+    for row, points in enumerate(W):
+        counted = points[points.any(-1)]
+        assert abs(metrics.ferrari_canny(one(contacts, row), "L1", SPACE) - ball(counted)) <= 1e-9
+        if len(counted) >= 7 and np.linalg.matrix_rank(counted) == 6:
+            assert abs(found.min_weight[row] - least_weight(counted)) <= PROGRAM_TOLERANCE
+        by_highs = [largest_task(counted, w / np.repeat([1, length[row]], 3)) for w in wanted]
+        assert abs(tasks[row] - min(by_highs)) <= PROGRAM_TOLERANCE * max(1, min(by_highs))
+    assert found.closed.sum() >= 3 and found.internal_moments is not None
+    held = np.asarray(found.closed)
+    forces = np.einsum("bcij,bcj->bci", contacts.frames, found.internal_forces)
+    moments = np.cross(contacts.positions, forces)
+    moments = moments + np.asarray(found.internal_moments)[..., None] * np.asarray(contacts.frames)[..., 2]
+    assert np.abs(forces.sum(1)[held]).max() <= 1e-9 and np.abs(moments.sum(1)[held]).max() <= 1e-9
+    hard = replace(contacts, torsional_friction=None)
+    alike = replace(contacts, torsional_friction=jnp.zeros_like(contacts.friction))
+    both = [np.asarray(least(c, SPACE)) for c in (hard, alike)]
+    np.testing.assert_allclose(*both, atol=1e-9)
+
+
 def test_turning_the_object_changes_nothing():
     contacts = random_contacts()
     R = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -28,6 +29,9 @@ EFFORT_TOLERANCE = 1e-6
 GRADIENT_TOLERANCE = 1e-5
 """Of max(1, slope), on nine grasps of ten: steps are as short as margins to 1e-9 allow, and some cross a kink."""
 
+SOFT_STALLED = 0.025
+"""Of soft contacts with exact cones one grasp in some hundred stalls near the tolerance; one of 48 is 2 %."""
+
 SHAPES = ((2, 6, 250), (4, 6, 800), (5, 24, 250), (8, 64, 110))
 """n_c, n_d, grasps; the recorded ones, twice 295, come on top."""
 
@@ -36,7 +40,11 @@ PYRAMIDS = ("13", "16", "per_direction", "per_direction_prestrained")
 
 def contacts_of(batch: chain.Batch, bound: float | np.ndarray = 1.0) -> jg.Contacts:
     return jg.Contacts.from_frames(
-        batch.positions, batch.frames, friction=batch.friction, max_force=batch.max_force * bound
+        batch.positions,
+        batch.frames,
+        friction=batch.friction,
+        max_force=batch.max_force * bound,
+        torsional_friction=batch.torsional,
     )
 
 
@@ -50,8 +58,13 @@ def of_full_rank(batch: chain.Batch) -> np.ndarray:
     return (chain.projections(batch.positions, batch.frames) == np.eye(6)).all((1, 2))
 
 
-def agree(batch: chain.Batch, name: str, **options) -> None:
+def agree(batch: chain.Batch, name: str, stalled: float = 0.0, **options) -> None:
+    """Every margin is the oracle's; a share of the grasps may be stalled, and say so."""
     ours = margins_of(batch, name, **options)
+    going = np.asarray(ours.status) != jg.Status.MAX_ITERATIONS
+    assert np.mean(~going) <= stalled
+    batch = batch[going]
+    ours = jax.tree.map(lambda x: x[going], ours)
     margin, status = np.asarray(ours.margin), np.asarray(ours.status)
     oracle = partial(chain.ORACLES[name], **({"norm_bound": True} if options else {}))
     truth = np.array([oracle(batch.case(i)) for i in range(len(batch))])
@@ -233,6 +246,61 @@ def test_pyramids_tend_to_cones_with_the_square_of_their_edges() -> None:
     assert 3 < worst[0] / worst[1] < 5.5 and 3 < worst[1] / worst[2] < 5.5
 
 
+def soft(batch: chain.Batch) -> chain.Batch:
+    """The same grasps with fingertips of millimetres and centimetres, some of them hard."""
+    rng = np.random.default_rng(8)
+    gamma = np.exp(rng.uniform(np.log(0.001), np.log(0.02), batch.friction.shape))
+    return replace(batch, torsional=gamma * (rng.uniform(size=gamma.shape) < 0.8))
+
+
+@pytest.mark.parametrize(
+    ("name", "norm"),
+    [("12", False), *[pytest.param(n, False, marks=pytest.mark.thorough) for n in chain.ORACLES if n != "12"]]
+    + [
+        pytest.param("12", True, marks=pytest.mark.thorough),
+        pytest.param("12_fixed", True, marks=pytest.mark.thorough),
+    ],
+)
+def test_margins_of_soft_contacts(name: str, norm: bool) -> None:
+    agree(soft(small()), name, SOFT_STALLED, **({"force_bound": "norm"} if norm else {}))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("shape", SHAPES[:3])
+def test_margins_of_soft_contacts_at_full_size(shape: tuple) -> None:
+    n_c, n_d, count = shape
+    for name in ("12", "12_fixed"):
+        agree(soft(chain.sample(100 + n_c, count, n_c, n_d)), name, SOFT_STALLED)
+
+
+@pytest.mark.thorough
+def test_the_chain_of_soft_contacts() -> None:
+    batch = soft(small())
+    found = jg.compare_formulations(contacts_of(batch), jg.DisturbanceSet.vertices(batch.wrenches), batch.load)
+    for more, less in (("12", "13"), ("12_fixed", "16"), ("13", "16"), ("12", "12_fixed")):
+        upper, lower = np.asarray(found.margins[more]), np.asarray(found.margins[less])
+        both = np.isfinite(upper) & np.isfinite(lower)
+        assert np.all((lower <= upper + SAME * np.maximum(1, upper))[both])
+    held = np.asarray(found.margins["16"]) > 0
+    error = np.abs(np.asarray(found.margins["21"]) - np.asarray(found.margins["16"]))[held]
+    assert held.sum() > 10 and np.all(error <= SAME * np.maximum(1, np.asarray(found.margins["16"])[held]))
+    # Moments come with their forces, and cones hold for both.
+    solution = margins_of(batch, "12")
+    assert solution.moments is not None and solution.disturbed_moments is not None
+    moved = np.asarray(solution.disturbed_forces)
+    reached = np.hypot(np.hypot(moved[..., 0], moved[..., 1]) / batch.friction[:, None], 0)
+    turned = np.asarray(solution.disturbed_moments) / np.where(batch.torsional > 0, batch.torsional, 1)[:, None]
+    solved = np.asarray(solution.status) == jg.Status.SOLVED
+    assert np.all((np.hypot(reached, turned) <= -moved[..., 2] + 1e-6)[solved])
+    assert not np.any(np.asarray(solution.moments)[solved] * (batch.torsional[solved] == 0))
+
+
+@pytest.mark.thorough
+def test_least_total_effort_of_soft_contacts() -> None:
+    batch = soft(small())
+    efforts_agree(batch, np.asarray(margins_of(batch, "13").margin))
+
+
 def effort(margin, batch: chain.Batch) -> jg.TotalEffortSolution:
     vertices = jg.DisturbanceSet.vertices(batch.wrenches)
     return jg.least_total_effort(contacts_of(batch), vertices, margin, batch.load)
@@ -342,9 +410,9 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="equation"):
         jg.specified_disturbances(contacts, forces, "10")
     with pytest.raises(ValueError, match="compliance"):
-        jg.least_total_effort(contacts, forces, compliance=jnp.eye(9))
+        jg.least_total_effort(contacts, forces, compliance=jnp.eye(8))
     with pytest.raises(ValueError, match="effort_weights: got shape"):
-        jg.least_total_effort(contacts, forces, effort_weights=jnp.eye(9))
+        jg.least_total_effort(contacts, forces, effort_weights=jnp.eye(8))
 
 
 @pytest.mark.thorough

@@ -258,7 +258,7 @@ def _declared(archive: Archive, name: str, given: Given) -> tuple[int, Candidate
     return rows, sample, pa.schema(columns)
 
 
-_NUMBERS = ("positions", "outward_normals", "frames", "friction", "max_force", "mass")
+_NUMBERS = ("positions", "outward_normals", "frames", "friction", "torsional_friction", "max_force", "mass")
 
 
 def _schema(stream: BinaryIO, kind: str) -> tuple[pa.Schema, int]:

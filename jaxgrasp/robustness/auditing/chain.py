@@ -32,17 +32,18 @@ class EffortVerdict(NamedTuple):
 
 
 def admissible(problem: Problem, forces: jax.Array, exact: bool, cone_edges: int, norm_bound: bool) -> jax.Array:
-    """Whether forces (lanes, n, 3) keep to their cones and bounds, (lanes,)."""
+    """Whether forces (lanes, n, k) keep to their cones and bounds, (lanes,)."""
     most = problem.max_force
     slack = MISSED[forces.dtype.name] * most
     normal, friction = forces[..., 2], problem.friction
     if exact:
-        tangent = jnp.sqrt(forces[..., 0] ** 2 + forces[..., 1] ** 2)
+        square = forces[..., 0] ** 2 + forces[..., 1] ** 2
+        tangent = jnp.sqrt(square if problem.arms is None else square + forces[..., 3] ** 2)
         over = tangent + friction * normal
         over = over if problem.reserve is None else over + problem.reserve[..., 0]
         within = (normal <= slack) & (over <= slack)
         if norm_bound:
-            within &= jnp.sqrt((forces * forces).sum(-1)) <= most + slack
+            within &= jnp.sqrt((forces[..., :3] ** 2).sum(-1)) <= most + slack
     else:
         cone = row_values(problem, forces, cone_edges)[0]
         if problem.reserve is not None:

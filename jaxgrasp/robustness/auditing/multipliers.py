@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
-from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.robustness.auditing.parts import (
     cross,
     divided,
@@ -20,7 +19,7 @@ from jaxgrasp.robustness.auditing.parts import (
     rows_of,
     sum_last,
 )
-from jaxgrasp.robustness.auditing.problem import Hand, Problem
+from jaxgrasp.robustness.auditing.problem import Hand, Problem, edges_of, facets
 from jaxgrasp.robustness.auditing.rows import Rows
 from jaxgrasp.robustness.interface.solution import Solution
 
@@ -65,18 +64,22 @@ def effort_unit(hand: Hand) -> jax.Array:
 def _pulled(problem: Problem, cone: jax.Array, bound: jax.Array, y: jax.Array) -> list[jax.Array]:
     """A'z + G'y by components, (lanes, n) each."""
     z = parts_of(cone)
-    first, second, normal = (weighed_sum(weights, z) for weights in pyramid_facets(len(z)).T)
+    pattern = facets(problem, edges_of(problem, cone))
+    first, second, normal, *moment = (weighed_sum(weights, z) for weights in pattern.T)
     given = [part[:, None] for part in parts_of(y)]
     turned = [given[a] + moment for a, moment in enumerate(cross(given[3:], parts_of(problem.positions)))]
     along = [inner(column, turned) for column in zip(*rows_of(problem.frames), strict=True)]
+    if problem.arms is not None:
+        along.append(problem.arms * inner(parts_of(problem.frames[..., 2]), given[3:]))
     along = [jnp.where(problem.transmits[..., k], part, 0) for k, part in enumerate(along)]
-    return [first + along[0], second + along[1], normal * problem.friction - bound + along[2]]
+    turning = [m + a for m, a in zip(moment, along[3:], strict=True)]
+    return [first + along[0], second + along[1], normal * problem.friction - bound + along[2], *turning]
 
 
 def _lost(problem: Problem, residual: Sequence[jax.Array]) -> jax.Array:
     """The most that r'f can be for the admissible forces of every contact, (lanes, n)."""
-    first, second, normal = (jnp.abs(part) for part in residual)
-    return ((first + second) * problem.friction + normal) * problem.max_force
+    first, second, normal, *moment = (jnp.abs(part) for part in residual)
+    return (fold(jnp.add, [first, second, *moment]) * problem.friction + normal) * problem.max_force
 
 
 def _held(problem: Problem, cone: jax.Array, bound: jax.Array) -> jax.Array:
@@ -181,7 +184,7 @@ def _weighed_by_effort(
         blocks = rows_of(weights)
         return [inner(row, forces) for row in blocks], divided(residual, blocks)
     flat = lambda parts: jnp.stack(parts, -1).reshape(*weights.shape[:-1], 1)
-    apart = lambda x: parts_of(x.reshape(*forces[0].shape, 3))
+    apart = lambda x: parts_of(x.reshape(*forces[0].shape, len(forces)))
     return apart(weights @ flat(forces)), apart(linalg.solve_positive(weights, flat(residual)))
 
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from jaxgrasp import linalg
 from jaxgrasp.arrays import fold, fold_last
 from jaxgrasp.lanes.fence import fenced
 
@@ -55,7 +56,10 @@ def cross(a: Sequence[jax.Array], b: Sequence[jax.Array]) -> list[jax.Array]:
 
 
 def divided(vectors: Sequence[jax.Array], matrices: list[list[jax.Array]]) -> list[jax.Array]:
-    """Q^-1 v by components, by the adjugate."""
+    """Q^-1 v by components, by the adjugate, or by elimination for soft contacts."""
+    if len(matrices) != 3:
+        whole = jnp.stack([jnp.stack(row, -1) for row in matrices], -2)
+        return parts_of(linalg.solve_positive(whole, jnp.stack(vectors, -1)[..., None])[..., 0])
     a, b, c = matrices
     # The columns of the adjugate.
     columns = cross(b, c), cross(c, a), cross(a, b)

@@ -4,10 +4,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxgrasp.arrays import fold_last
 from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
+from jaxgrasp.contact.friction import contact_facets
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.robustness.actuators import Actuated, clip_limits
 from jaxgrasp.robustness.interface.arguments import Arguments, Inputs
@@ -19,8 +21,9 @@ class Problem(NamedTuple):
     positions, frames: as in `Contacts`; whatever is given where a contact is absent.
     friction, max_force: as in `Contacts`; 0 and 1 where a contact is absent. A contact without friction has friction 1:
         the rows of C then say that it does not pull.
+    arms: (lanes, n), m, moments about the normals per newton of the fourth component of forces; None for hard contacts.
     present: bool (lanes, n).
-    transmits: bool (lanes, n, 3), which components of force a contact has: without friction the normal one alone.
+    transmits: bool (lanes, n, k), which components of force a contact has: without friction the normal one alone.
     size: (lanes,), m, root-mean-square distance of the contacts from the centre of mass; 1 where that is zero.
     wrench: (lanes, 6), b, N and N m.
     reserve: (lanes, n or 1, n_e or 1), d, N, zero where a contact is absent; None where there is none.
@@ -34,6 +37,7 @@ class Problem(NamedTuple):
     frames: jax.Array
     friction: jax.Array
     max_force: jax.Array
+    arms: jax.Array | None
     present: jax.Array
     transmits: jax.Array
     size: jax.Array
@@ -67,7 +71,9 @@ def problem_of(arguments: Arguments) -> Problem:
     data, contacts, compliance = inputs.data, inputs.data.contacts, inputs.data.compliance
     assert data.required_wrench is not None
     present, rough = contacts.active, contacts.active & (contacts.friction > 0)
-    transmits = jnp.stack([rough, rough, jnp.broadcast_to(present, rough.shape)], -1)
+    arms = contacts.torsional_arms
+    turning = [] if arms is None else [present & (arms > 0)]
+    transmits = jnp.stack([rough, rough, jnp.broadcast_to(present, rough.shape), *turning], -1)
     here = lambda x, other: jnp.where(present.reshape(*present.shape, *[1] * (x.ndim - 2)), x, other)
     positions = here(contacts.positions, 0)
     friction, max_force = here(jnp.where(rough, contacts.friction, 1), 0), here(contacts.max_force, 1)
@@ -82,6 +88,7 @@ def problem_of(arguments: Arguments) -> Problem:
         frames=contacts.frames,
         friction=friction,
         max_force=max_force,
+        arms=None if arms is None else here(arms, 0),
         present=present,
         transmits=transmits,
         size=largest * jnp.sqrt(jnp.where(square > 0, square, 1)),
@@ -133,3 +140,13 @@ def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:
     """Lane `turn` of every `stride` lanes; what is left over at the end is not looked at."""
     blocks = x[: x.shape[0] // stride * stride].reshape(-1, stride, *x.shape[1:])
     return jax.lax.dynamic_index_in_dim(blocks, turn, 1, keepdims=False)
+
+
+def facets(problem: Problem, cone_edges: int) -> np.ndarray:
+    """The facet rows for unit friction: (n_e, 3), of soft contacts (2 n_e, 4)."""
+    return contact_facets(cone_edges, 3 if problem.arms is None else 4)
+
+
+def edges_of(problem: Problem, cone: jax.Array) -> int:
+    """n_e, from numbers of every facet (..., facets)."""
+    return cone.shape[-1] if problem.arms is None else cone.shape[-1] // 2

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
-from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.robustness.auditing import hidden
 from jaxgrasp.robustness.auditing.multipliers import (
     CLOSED,
@@ -37,7 +36,7 @@ from jaxgrasp.robustness.auditing.parts import (
     parts_of,
     sum_last,
 )
-from jaxgrasp.robustness.auditing.problem import Hand, Problem, problem_of
+from jaxgrasp.robustness.auditing.problem import Hand, Problem, edges_of, facets, problem_of
 from jaxgrasp.robustness.auditing.rows import Range, Rows, own_rows
 from jaxgrasp.robustness.interface.arguments import Arguments
 from jaxgrasp.robustness.interface.solution import Solution
@@ -69,14 +68,14 @@ def judge(arguments: Arguments, solution: Solution, evidence: Evidence, anew: bo
     """
     problem, rows, place = problem_of(arguments), evidence.rows, None
     if anew:
-        rows, place = own_rows(problem, solution.cone_multipliers.shape[-1], solution.rank)
+        rows, place = own_rows(problem, edges_of(problem, solution.cone_multipliers), solution.rank)
     return _judged(problem, solution, evidence, rows, place, smooth)
 
 
 def spot(arguments: Arguments, solution: Solution, evidence: Evidence) -> jax.Array:
     """Where S_1 and S_2 are not those that the solver used, or the set does not lie where it claims, (lanes,)."""
     problem, used = problem_of(arguments), evidence.rows
-    rows, place = own_rows(problem, solution.cone_multipliers.shape[-1], solution.rank)
+    rows, place = own_rows(problem, edges_of(problem, solution.cone_multipliers), solution.rank)
     # What counts is what a row loses at the margin, or at the disturbance that takes a whole row by itself.
     force, there = problem.max_force, problem.present
     taken = jnp.maximum(max_last(used.cone) / jnp.where(problem.friction > 0, problem.friction, jnp.inf), used.bound)
@@ -169,7 +168,7 @@ def _primal(problem: Problem, solution: Solution, rows: Rows) -> tuple[jax.Array
     def attained(problem: Problem, forces: jax.Array, rows: Rows) -> jax.Array:
         """By every contact, (lanes, n)."""
         slack = missed * problem.max_force
-        cone, bound = row_values(problem, forces, rows.cone.shape[-1])
+        cone, bound = row_values(problem, forces, edges_of(problem, rows.cone))
         reserve = reserves(problem, len(cone))
         parts = [_most(slack - reserve[k] - row, rows.cone[..., k]) for k, row in enumerate(cone)]
         parts += [_most(problem.max_force + slack - bound, rows.bound)]
@@ -194,8 +193,9 @@ def _most(spare: jax.Array, loss: jax.Array) -> jax.Array:
 
 def row_values(problem: Problem, forces: jax.Array, cone_edges: int) -> tuple[list[jax.Array], jax.Array]:
     """C f of every facet, and -f_n, (lanes, n) each."""
-    pressed = forces[..., 0], forces[..., 1], problem.friction * forces[..., 2]
-    return [weighed_sum(facet, pressed) for facet in pyramid_facets(cone_edges)], -forces[..., 2]
+    pressed = parts_of(forces)
+    pressed[2] = problem.friction * pressed[2]
+    return [weighed_sum(facet, pressed) for facet in facets(problem, cone_edges)], -forces[..., 2]
 
 
 def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = None) -> jax.Array:
@@ -211,11 +211,16 @@ def balanced(problem: Problem, forces: jax.Array, wrench: jax.Array | None = Non
         return pushes, jnp.sqrt(inner(f, f)), all_last((forces == 0) | problem.transmits)
 
     @once
-    def moments(problem: Problem, pushes: jax.Array) -> list[jax.Array]:
-        return [jnp.where(problem.present, x, 0) for x in cross(parts_of(problem.positions), parts_of(pushes))]
+    def moments(problem: Problem, pushes: jax.Array, forces: jax.Array | None) -> list[jax.Array]:
+        turns = cross(parts_of(problem.positions), parts_of(pushes))
+        if problem.arms is not None and forces is not None:
+            twist = jnp.where(problem.transmits[..., 3], problem.arms * forces[..., 3], 0)
+            turns = [x + n * twist for x, n in zip(turns, parts_of(problem.frames[..., 2]), strict=True)]
+        return [jnp.where(problem.present, x, 0) for x in turns]
 
     pushes, sizes, possible = turned(problem, forces)
-    given = [sum_last(part) for part in parts_of(pushes) + moments(problem, pushes)]
+    soft = None if problem.arms is None else forces
+    given = [sum_last(part) for part in parts_of(pushes) + moments(problem, pushes, soft)]
     in_newtons = lambda parts: parts[:3] + [moment / problem.size for moment in parts[3:]]
     load = in_newtons(parts_of(problem.wrench))
     wanted = load if wrench is None else in_newtons(parts_of(wrench))

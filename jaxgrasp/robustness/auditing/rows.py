@@ -16,13 +16,12 @@ from jax import lax
 
 from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
-from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.contact.row_space import RANK_TOLERANCE
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.fence import fences
 from jaxgrasp.robustness.auditing.parts import cross, once
-from jaxgrasp.robustness.auditing.problem import Problem
+from jaxgrasp.robustness.auditing.problem import Problem, facets
 
 # Shares of the longest row between which a row may count as independent or not: there the solver's word is taken.
 _DOUBTFUL = {"float64": (1e-13, 1e-6), "float32": (1e-7, 3e-3)}
@@ -96,10 +95,13 @@ def own_inverse(problem: Problem) -> jax.Array:
 
 
 def _stacked_rows(problem: Problem) -> jax.Array:
-    """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, 3 n, lanes)."""
+    """G, and N'J' where actuators do not reach every joint direction, moments by size: (6 + r, k n, lanes)."""
     frames = jnp.moveaxis(problem.frames, (2, 1, 3, 0), (0, 1, 2, 3))
     arms = jnp.moveaxis(problem.positions, (2, 1, 0), (0, 1, 2))[:, :, None]
     blocks = jnp.concatenate([frames, jnp.stack(cross(list(arms), list(frames))) / problem.size])
+    if problem.arms is not None:
+        torsion = frames[:, :, 2:] * (problem.arms.T / problem.size)[:, None]
+        blocks = jnp.concatenate([blocks, jnp.concatenate([jnp.zeros_like(torsion), torsion])], 2)
     rows = jnp.where(jnp.moveaxis(problem.transmits, 0, -1), blocks, 0).reshape(6, -1, blocks.shape[-1])
     hand = problem.hand
     if hand is None or hand.unreached is None:
@@ -178,12 +180,12 @@ def _weighted(
     """G* (3 n, r, lanes) for a compliance with lanes leading; None for Q = I."""
     if compliance is None:
         return plain.inverse
-    n = problem.present.shape[-1]
-    there = problem.transmits.reshape(-1, 3 * n)
-    if compliance.shape[-2:] != (3 * n, 3 * n):
+    n, size = problem.present.shape[-1], rows.shape[1]
+    there = problem.transmits.reshape(-1, size)
+    if compliance.shape[-2:] != (size, size):
         blocks = jnp.eye(n, dtype=rows.dtype)[:, None, :, None] * compliance[:, :, :, None, :]
-        compliance = blocks.reshape(blocks.shape[0], 3 * n, 3 * n)
-    eye = jnp.eye(3 * n, dtype=rows.dtype)
+        compliance = blocks.reshape(blocks.shape[0], size, size)
+    eye = jnp.eye(size, dtype=rows.dtype)
     sane = jnp.where(there[:, :, None] & there[:, None, :], compliance, eye)
     # M = L^-T for Q = L L'.
     half = jnp.swapaxes(linalg.inverse_root(sane), 1, 2)
@@ -195,16 +197,21 @@ def _reached(problem: Problem, inverse: jax.Array, cone_edges: int, wrench: jax.
     """What the set, or a single wrench (6, lanes), takes from every row, given G* (3 n, r, lanes)."""
     n, lanes = problem.present.shape[-1], inverse.shape[-1]
     units = _units(problem.size)
-    # (6, n, lanes) each: the rows of G* for tangents and normal.
-    first, second, normal = jnp.moveaxis(inverse[:, :6].reshape(n, 3, 6, lanes), (1, 2), (0, 1)) * units[:, None]
+    # (6, n, lanes) each: the rows of G* for tangents and normal, and for moments.
+    answers = inverse[:, :6].reshape(n, -1, 6, lanes)
+    first, second, normal, *moment = jnp.moveaxis(answers, (1, 2), (0, 1)) * units[:, None]
     # The rows of C and, after them, of -E: XLA puts arrays together a number at a time.
-    rows = np.concatenate([pyramid_facets(cone_edges), [[0, 0, -1]]])
-    slip = jnp.where(jnp.arange(len(rows))[:, None, None] < cone_edges, problem.friction.T, 1)
-    c, s, k = jnp.asarray(rows, inverse.dtype).T[:, :, None, None]
-    parts = [-(c * first[:, None] + s * second[:, None] + k * slip * normal[:, None]).reshape(6, -1, lanes)]
+    pattern = facets(problem, cone_edges)
+    rows = np.concatenate([pattern, 0 - np.eye(pattern.shape[1])[2:3]])
+    slip = jnp.where(jnp.arange(len(rows))[:, None, None] < len(pattern), problem.friction.T, 1)
+    c, s, k, *pole = jnp.asarray(rows, inverse.dtype).T[:, :, None, None]
+    taken = c * first[:, None] + s * second[:, None] + k * slip * normal[:, None]
+    for p, m in zip(pole, moment, strict=True):
+        taken = taken + p * m[:, None]
+    parts = [-taken.reshape(6, -1, lanes)]
     if problem.hand is not None:
         hand = problem.hand
-        torque = jnp.einsum("liav,iacl->lvc", hand.jacobian, inverse[:, :6].reshape(n, 3, 6, lanes))
+        torque = jnp.einsum("liav,iacl->lvc", hand.jacobian, answers)
         effort = jnp.einsum("luv,lvc->cul", *_alike(hand.inverse, torque)) * units[:, None]
         parts += [-effort, effort]
     directions = jnp.concatenate(parts, 1) if len(parts) > 1 else parts[0]

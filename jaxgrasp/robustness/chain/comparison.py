@@ -11,7 +11,7 @@ from jaxgrasp.arrays import literal
 from jaxgrasp.compiling import own_settings
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.friction import contact_facets, pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.records import record
 from jaxgrasp.robustness.chain.formulations import (
@@ -161,13 +161,15 @@ def _binding(contacts: Contacts, reduced: Solution, unreduced: FormulationSoluti
     flat = z.reshape(*z.shape[:-2], z.shape[-2] * z.shape[-1])
     where = jnp.argmax(flat, -1)
     contact, row = where // z.shape[-1], where % z.shape[-1]
-    facets = literal(pyramid_facets(cone_edges), z.dtype)
-    # (*batch, directions, n, 3): the blocking forces, as far as the margin goes.
+    facets = literal(contact_facets(cone_edges, contacts.components), z.dtype)
+    # (*batch, directions, n, k), moments in newtons: the blocking forces, as far as the margin goes.
     moved = unreduced.disturbed_forces - unreduced.forces[..., None, :, :]
     moved = jnp.take_along_axis(moved, contact[..., None, None, None], -2)[..., 0, :]
     mu = jnp.take_along_axis(friction, contact[..., None], -1)[..., None]
-    slip = moved[..., :2] @ facets[:, :2].T + mu * moved[..., 2:] * facets[:, 2]
-    loads = jnp.concatenate([slip, -moved[..., 2:]], -1)
+    slip = moved[..., :2] @ facets[:, :2].T + mu * moved[..., 2:3] * facets[:, 2]
+    if contacts.torsional_friction is not None:
+        slip = slip + moved[..., 3:] * facets[:, 3]
+    loads = jnp.concatenate([slip, -moved[..., 2:3]], -1)
     loads = jnp.take_along_axis(loads, row[..., None, None], -1)[..., 0]
     binds = jnp.isfinite(reduced.margin) & (reduced.margin >= 0) & (jnp.max(flat, -1) > 0)
     direction = jnp.where(jnp.max(loads, -1) > 0, jnp.argmax(loads, -1), -1)
@@ -187,6 +189,10 @@ class SpecifiedDisturbances:
     """The factor by which the disturbances could be scaled; NaN where b alone cannot be borne."""
     status: Int[Array, "*batch"]
     """SOLVED where there are such forces, INFEASIBLE where there are none; otherwise as for the margin."""
+    moments: Float[Array, "*batch contacts"] | None = None
+    """The moments about the normals that come with `forces`, N m; None for hard contacts."""
+    moment_changes: Float[Array, "*batch directions contacts"] | None = None
+    """The same of `changes`."""
 
 
 @own_settings()
@@ -243,9 +249,15 @@ def specified_disturbances(
     # At lambda = margin the forces are admissible, at 0 as well, so they are in between.
     share = jnp.where(holds, 1 / jnp.where(holds, margin, 1), jnp.nan)[..., None, None]
     moved = found.disturbed_forces - found.forces[..., None, :, :]
+    moments = moment_changes = None
+    if found.moments is not None and found.disturbed_moments is not None:
+        moments = jnp.where(holds[..., None], found.moments, jnp.nan)
+        moment_changes = share * (found.disturbed_moments - found.moments[..., None, :])
     return SpecifiedDisturbances(
         forces=jnp.where(holds[..., None, None], found.forces, jnp.nan),
         changes=share[..., None] * moved,
         margin=margin,
         status=status,
+        moments=moments,
+        moment_changes=moment_changes,
     )

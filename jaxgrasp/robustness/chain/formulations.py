@@ -55,6 +55,7 @@ from jaxgrasp.robustness.chain.verdicts import (
     build_solution,
     select_programs,
     solve_program,
+    with_moments,
 )
 from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, lay_out
@@ -153,17 +154,23 @@ def formulation_margin(
     polytope, inverse = polytope_of(disturbances), None
     shares_f0 = not FORMULATIONS[formulation].free and FORMULATIONS[formulation].one_f0
     if polytope is None and shares_f0:
+        if contacts.torsional_friction is not None:
+            raise ValueError(
+                f"disturbances: got a set without vertices for {formulation!r} and soft contacts, wanted vertices or a "
+                "box, or contacts without torsional_friction"
+            )
         if force_bound == "norm":
             raise ValueError("force_bound: got 'norm' for '12_fixed' and a set without vertices, wanted 'normal'")
         inverse = weighted_pseudo_inverse(contacts, compliance)
         polytope = worst_of_rows(contacts, disturbances, inverse, cone_edges)
     if not is_refined(disturbances, formulation) or 0 in contacts.batch_shape:
-        return solve(replace(given, disturbances=polytope or DisturbanceSet.vertices(jnp.zeros((1, 6)))))
+        vertices = polytope or DisturbanceSet.vertices(jnp.zeros((1, 6)))
+        return with_moments(solve(replace(given, disturbances=vertices)), contacts)
     check_known(given)
     tolerance = TOLERANCE[contacts.positions.dtype.name] if tolerance is None else tolerance
     arguments = lay_out(given, Options())
     if polytope is None or inverse is None:
-        return refine(arguments, solve, tolerance)
+        return with_moments(refine(arguments, solve, tolerance), contacts)
     flat = lambda x: np.asarray(jnp.broadcast_to(x, (*arguments.batch, *x.shape[-2:])).reshape(-1, *x.shape[-2:]))
     return refine_shared(arguments, solve, flat(wrenches_of(polytope.terms)), flat(inverse), tolerance)
 
@@ -278,8 +285,9 @@ class Chain(Audited):
             holds &= all_hold(problem, solution.disturbed_forces, wrenches, check)
         else:
             # Nothing ties the directions together but the smallest of their margins.
-            sizes = jnp.stack([problem.friction * problem.max_force] * 2 + [problem.max_force], 1)
-            sizes *= jnp.swapaxes(problem.transmits, 1, 2)
+            sliding = problem.friction * problem.max_force
+            sizes = jnp.stack([sliding, sliding, problem.max_force, sliding][: point.x.shape[1]], 1)
+            sizes *= jnp.swapaxes(problem.transmits, 1, 2).astype(sizes.dtype)
             forces = jnp.moveaxis(point.x[..., :-1] * sizes[..., None], (3, 2), (1, 2))
             wrenches = disturbed_wrenches(problem, directions)
             looked_at = jnp.isfinite(directions) & (directions > 0)

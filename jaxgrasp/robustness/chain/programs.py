@@ -19,11 +19,11 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import pseudo_inverse
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.friction import contact_facets
 from jaxgrasp.contact.row_space import RANK_TOLERANCE, whitened
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.program import LEAST_FRICTION
+from jaxgrasp.robustness.tightening.program import LEAST_FRICTION, force_units
 from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
 
 
@@ -56,9 +56,9 @@ class Basics:
     """The scaled data that all formulations share; lanes trail."""
 
     sizes: jax.Array
-    """(3, n, *lanes), the units of forces, N: f = sizes * x."""
+    """(k, n, *lanes), the units of forces, N: f = sizes * x."""
     columns: jax.Array
-    """(6, 3, n, *lanes), the orthonormal rows of G for scaled forces; zero where dropped."""
+    """(6, k, n, *lanes), the orthonormal rows of G for scaled forces; zero where dropped."""
     dropped: jax.Array
     """(6, *lanes), 1 where a row was dropped."""
     wrenches: jax.Array
@@ -68,7 +68,7 @@ class Basics:
     targets: jax.Array
     """(6, n_d, *lanes), W_j in the orthonormal rows."""
     blocking_forces: jax.Array | None
-    """(n_d, 3, n, *lanes), the blocking forces for lambda = 1, N; None where no formulation asks for them."""
+    """(n_d, k, n, *lanes), the blocking forces for lambda = 1, N; None where no formulation asks for them."""
     disturbed: jax.Array
     """bool (n_d, *lanes), whether W_j is not zero."""
     outside: jax.Array
@@ -95,7 +95,7 @@ def compute_basics(grasps: Grasps, with_blocking_forces: bool) -> Basics:
     dtype, present = grasps.present.dtype, grasps.present
     tolerance = 10 * RANK_TOLERANCE[dtype.name]
     tangential = jnp.maximum(grasps.friction, LEAST_FRICTION[dtype.name]) * grasps.max_force
-    sizes = jnp.stack([tangential, tangential, grasps.max_force])
+    sizes = force_units(tangential, grasps.max_force, grasps.columns.shape[1])
     mean = fold(jnp.add, grasps.max_force * present) / jnp.maximum(fold(jnp.add, present), 1)
     mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
     rows = whitened(grasps.columns * (sizes / mean))
@@ -172,7 +172,7 @@ def scale_formulation(grasps: Grasps, basics: Basics, form: Formulation, cone_ed
 
 
 def compute_blocking_forces(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
-    """Blocking forces -G*_j W_j (n_d, 3, n, *lanes) against wrenches (6, n_d, *lanes), N."""
+    """Blocking forces -G*_j W_j (n_d, k, n, *lanes) against wrenches (6, n_d, *lanes), N."""
     if grasps.vertex_inverse_roots is None:
         inverse = pseudo_inverse(grasps.columns, grasps.inverse_root)[0]
         forces = -jnp.einsum("aen...,ed...->dan...", inverse, wrenches)
@@ -183,24 +183,28 @@ def compute_blocking_forces(grasps: Grasps, wrenches: jax.Array) -> jax.Array:
 
 
 def contact_rows(grasps: Grasps, basics: Basics, exact: bool, cone_edges: int, norm_bound: bool) -> list[ConeRows]:
-    """The rows of a contact, without sigma: friction, then the bound on the force."""
-    friction = grasps.friction
+    """The rows of a contact, without sigma: friction, then the bound on the force, in which moments do not count."""
+    friction, components = grasps.friction, len(basics.sizes)
     none = jnp.zeros((1, 1, 1, 1, 1), friction.dtype)
     make = lambda kind, patterns, h, stretch=None, reserve=None: ConeRows(
         second_order=kind, patterns=tuple(map(tuple, patterns)), h=h, sigma=none, stretch=stretch, reserve=reserve
     )
-    normal = (0.0, 0.0, -1.0)
+    axes = np.eye(components).tolist()
+    normal = (0 - np.eye(components)[2]).tolist()
     if not exact:
-        facets = pyramid_facets(cone_edges).tolist()
-        reserve = _reserve(grasps, basics, cone_edges, 1)
-        return [make(False, [*facets, normal], (*[0.0] * cone_edges, 1.0), reserve=reserve)]
-    rows = [(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)]
-    coulomb = make(True, rows, (0.0, 0.0, 0.0), reserve=_reserve(grasps, basics, 1, 2))
+        facets = contact_facets(cone_edges, components).tolist()
+        reserve = _reserve(grasps, basics, len(facets), 1)
+        return [make(False, [*facets, normal], (*[0.0] * len(facets), 1.0), reserve=reserve)]
+    # Of a soft contact the ellipsoid, |(f_t, m mu / gamma)| <= -mu f_n.
+    sliding = (0 - np.delete(np.eye(components), 2, 0)).tolist()
+    reserve = _reserve(grasps, basics, 1, components - 1)
+    coulomb = make(True, [axes[2], *sliding], (0.0,) * components, reserve=reserve)
     if not norm_bound:
         return [coulomb, make(False, [normal], (1.0,))]
     slip = jnp.maximum(friction, LEAST_FRICTION[friction.dtype.name])[:, None]
-    stretch = jnp.stack([slip, slip, jnp.ones_like(slip)])
-    return [coulomb, make(True, [(0.0, 0.0, 0.0), *(-np.eye(3)).tolist()], (1.0, 0.0, 0.0, 0.0), stretch)]
+    stretch = jnp.stack([slip, slip, jnp.ones_like(slip), slip][:components])
+    forces = (-np.eye(components)[:3]).tolist()
+    return [coulomb, make(True, [(0.0,) * components, *forces], (1.0, 0.0, 0.0, 0.0), stretch)]
 
 
 def _reserve(grasps: Grasps, basics: Basics, rows: int, others: int) -> jax.Array | None:

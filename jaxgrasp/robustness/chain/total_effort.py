@@ -9,9 +9,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxgrasp.arrays import as_float
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.compliance import Compliance, is_full
 from jaxgrasp.contact.contacts import Contacts
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.friction import contact_facets, pyramid_facets
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.lanes.differentiable import Along, OfPyramids, Tree
 from jaxgrasp.lanes.tiles import Each
@@ -31,6 +32,7 @@ from jaxgrasp.robustness.chain.programs import FORMULATIONS, Basics, compute_bas
 from jaxgrasp.robustness.chain.verdicts import Decision, decide, select_programs, solve_program
 from jaxgrasp.robustness.grasps import Grasps, admit_all, over_grasps
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Options, optional_float
+from jaxgrasp.robustness.interface.solution import split
 from jaxgrasp.solvers import interior_point
 from jaxgrasp.solvers.block.arrow import ArrowProblem, build_rows
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
@@ -68,6 +70,10 @@ class TotalEffortSolution:
     """`Status`."""
     iterations: Int[Array, "*batch"]
     """Interior-point steps, after those of (13)."""
+    moments: Float[Array, "*batch contacts"] | None = None
+    """The moments about the normals that come with `forces`, N m; None for hard contacts."""
+    moment_changes: Float[Array, "*batch directions contacts"] | None = None
+    """The same of `changes`."""
 
 
 def least_total_effort(
@@ -119,7 +125,17 @@ def least_total_effort(
     options = Options(
         margin=as_float("margin", margin, ()), effort_weights=optional_float("effort_weights", effort_weights)
     )
-    return over_grasps(_TotalEffort(cone_edges, choose_tile(contacts, disturbances)), data, options)[0]
+    found = over_grasps(_TotalEffort(cone_edges, choose_tile(contacts, disturbances)), data, options)[0]
+    return found if contacts.torsional_friction is None else _split(found, contacts)
+
+
+@compiled
+def _split(found: TotalEffortSolution, contacts: Contacts) -> TotalEffortSolution:
+    """Split the forces of soft contacts, whose fourth component is m / arm, into forces and moments."""
+    forces, moments = split(found.forces, contacts)
+    each = jax.tree.map(lambda x: jnp.expand_dims(x, len(contacts.batch_shape)), contacts)
+    changes, moment_changes = split(found.changes, each)
+    return replace(found, forces=forces, moments=moments, changes=changes, moment_changes=moment_changes)
 
 
 @dataclass(frozen=True)
@@ -168,7 +184,7 @@ class _TotalEffort(OfPyramids, Audited):
         changed = {
             f.name: hidden(getattr(solution, f.name), verdicts.failed, jnp.nan)
             for f in fields(solution)
-            if f.name not in ("status", "iterations")
+            if f.name not in ("status", "iterations", "moments", "moment_changes")
         }
         status = hidden(solution.status, verdicts.failed, Status.NOT_VERIFIED)
         return replace(solution, **changed, status=status), record
@@ -242,20 +258,20 @@ def _asked(grasps: Grasps) -> jax.Array:
 
 
 def _scaled_weights(matrices: jax.Array | None, sizes: jax.Array, present: jax.Array) -> jax.Array:
-    """D Q D with copies before the lanes, (3, 3, n, 1 or n_d, *lanes) or (3 n, 3 n, 1 or n_d, *lanes).
+    """D Q D with copies before the lanes, (k, k, n, 1 or n_d, *lanes) or (k n, k n, 1 or n_d, *lanes).
 
     Args:
-        matrices: Q, blocks (1 or n_d, n, 3, 3, *lanes) or full (1 or n_d, 3 n, 3 n, *lanes); None for the identity.
-        sizes: D, (3, n, *lanes).
+        matrices: Q, blocks (1 or n_d, n, k, k, *lanes) or full (1 or n_d, k n, k n, *lanes); None for the identity.
+        sizes: D, (k, n, *lanes).
         present: (n, *lanes).
     """
-    n = len(present)
+    k, n = sizes.shape[:2]
     if matrices is not None and is_full(matrices[0], n):
-        flat, there = flatten(sizes), jnp.repeat(present, 3, 0)
-        eye = jnp.eye(3 * n, dtype=sizes.dtype)[..., None]
+        flat, there = flatten(sizes), jnp.repeat(present, k, 0)
+        eye = jnp.eye(k * n, dtype=sizes.dtype)[..., None]
         scaled = (matrices + jnp.swapaxes(matrices, 1, 2)) / 2 * flat[:, None] * flat * (there[:, None] * there)
         return jnp.moveaxis(scaled + eye * (1 - there), 0, 2)
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=sizes.dtype)[..., None, None], (3, 3, *present.shape))
+    eye = jnp.broadcast_to(jnp.eye(k, dtype=sizes.dtype)[..., None, None], (k, k, *present.shape))
     if matrices is None:
         return (eye * sizes[:, None] * sizes * present + eye * (1 - present))[:, :, :, None]
     blocks = jnp.moveaxis((matrices + jnp.swapaxes(matrices, 2, 3)) / 2, (2, 3, 1, 0), (0, 1, 2, 3))
@@ -266,16 +282,17 @@ def _scaled_weights(matrices: jax.Array | None, sizes: jax.Array, present: jax.A
 
 def _problem(grasps: Grasps, basics: Basics, cone_edges: int, guess: jax.Array) -> tuple[ArrowProblem, jax.Array]:
     """(11) in scaled forces, and the unit of effort."""
-    dtype, weights = basics.sizes.dtype, grasps.options.effort_weights
+    dtype, weights, k = basics.sizes.dtype, grasps.options.effort_weights, len(basics.sizes)
     rest = _scaled_weights(None if weights is None else weights[None], basics.sizes, grasps.present)
     change = _scaled_weights(grasps.compliance, basics.sizes, grasps.present)
     over = lambda h: jnp.max(jnp.abs(h), tuple(range(h.ndim - 1)))
     largest = jnp.maximum(over(rest), over(change))
     unit = lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     targets = jnp.concatenate([basics.load[:, None] - _asked(grasps) * basics.targets, basics.load[:, None]], 1)
-    patterns, h = build_rows(pyramid_facets(cone_edges), dtype, 3)
+    facets = contact_facets(cone_edges, k)
+    patterns, h = build_rows(facets, dtype, 3)
     if grasps.reserve is not None:
-        reserve = grasps.row_reserves(basics.sizes[0], cone_edges)[:, :, None]
+        reserve = grasps.row_reserves(basics.sizes[0], len(facets))[:, :, None]
         h = jnp.concatenate([h[:-1] - reserve, jnp.broadcast_to(h[-1:], reserve[:1].shape)])
     problem = ArrowProblem(
         patterns=patterns,

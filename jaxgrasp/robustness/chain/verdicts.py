@@ -1,14 +1,18 @@
 """The chain's formulations, from the outcome of their programs to solutions with bounds and statuses."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxgrasp.compiling import compiled
+from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.records import record
 from jaxgrasp.robustness.chain.programs import Basics, Formulation, Scaled
 from jaxgrasp.robustness.grasps import Grasps
+from jaxgrasp.robustness.interface.solution import split
 from jaxgrasp.solvers.conic import embedding
 from jaxgrasp.solvers.conic.embedding import ConicOutcome
 from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
@@ -47,7 +51,8 @@ class FormulationSolution:
     contact: Int[Array, "*batch"]
     """The contact that binds: of its rows one has the largest multiplier; -1 where there is no answer."""
     row: Int[Array, "*batch"]
-    """The row of that contact: facets 0 .. n_e - 1, then the bound on the force; with exact cones 0 and 1."""
+    """The row of that contact: facets 0 .. n_e - 1 (2 n_e - 1 of soft contacts), then the bound on the force; with
+    exact cones 0 and 1."""
     iterations: Int[Array, "*batch"]
     """Interior-point steps, the most of any direction."""
     primal_residual: Float[Array, "*batch"]
@@ -56,6 +61,25 @@ class FormulationSolution:
     """(upper_bound - margin) / max(scale, margin), over upper_bound where directions are refined."""
     worst_wrench: Float[Array, "*batch 6"] | None = None
     """The member of the set that decides, N and N m, where directions are refined; else None."""
+    moments: Float[Array, "*batch contacts"] | None = None
+    """The moments about the normals that come with `forces`, N m; None for hard contacts."""
+    disturbed_moments: Float[Array, "*batch directions contacts"] | None = None
+    """The same of `disturbed_forces`."""
+
+
+def with_moments(solution: FormulationSolution, contacts: Contacts) -> FormulationSolution:
+    """Split the forces of soft contacts, whose fourth component is m / arm, into forces and moments."""
+    return solution if contacts.torsional_friction is None else _split(solution, contacts)
+
+
+@compiled
+def _split(solution: FormulationSolution, contacts: Contacts) -> FormulationSolution:
+    forces, moments = split(solution.forces, contacts)
+    each = jax.tree.map(lambda x: jnp.expand_dims(x, len(contacts.batch_shape)), contacts)
+    disturbed = split(solution.disturbed_forces, each)
+    return replace(
+        solution, forces=forces, moments=moments, disturbed_forces=disturbed[0], disturbed_moments=disturbed[1]
+    )
 
 
 def select_programs(grasps: Grasps, basics: Basics, scaled: Scaled, free: bool) -> tuple[ConicMargin, jax.Array]:
@@ -157,7 +181,7 @@ def build_solution(
 
 
 def _balance(grasps: Grasps, basics: Basics, rest: jax.Array, forces: jax.Array, reached: jax.Array) -> jax.Array:
-    """Whether f_0 (3, n, *lanes) supplies b and forces (n_d, 3, n, *lanes) supply b - lambda_j W_j, (*lanes).
+    """Whether f_0 (k, n, *lanes) supplies b and forces (n_d, k, n, *lanes) supply b - lambda_j W_j, (*lanes).
 
     Directions without a lambda_j above 0 do not count.
     """
@@ -201,7 +225,7 @@ def _feasibility(
 def _forces(
     basics: Basics, form: Formulation, x: jax.Array, directions: jax.Array, margin: jax.Array, program: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """f_0 (3, n, *lanes) and f_0 + delta f_j at the margin (n_d, 3, n, *lanes), N, of x (3, n, D, *lanes)."""
+    """f_0 (k, n, *lanes) and f_0 + delta f_j at the margin (n_d, k, n, *lanes), N, of x (k, n, D, *lanes)."""
     each = jnp.moveaxis(x, 2, 0) * basics.sizes
     if form.free:
         # On the way from f_0 to what bears the most that this direction allows.

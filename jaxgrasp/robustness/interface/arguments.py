@@ -36,8 +36,8 @@ class GraspData:
     required_wrench: Float[Array, "*batch 6"] | None
     """b, N and N m; None is zero."""
     compliance: Float[Array, "..."] | Compliance | None
-    """Q as blocks (*batch, contacts, 3, 3) or full (*batch, 3 contacts, 3 contacts), or one for each vertex of the
-    disturbance set; None is the identity."""
+    """Q as blocks (*batch, contacts, k, k) or full (*batch, k contacts, k contacts), or one for each vertex of the
+    disturbance set; None is the identity. k = 3, or 4 for soft contacts."""
     cone_margin: Float[Array, "..."] | None
     """d, N: what the facet rows keep in reserve, one value a grasp, a contact or a row; None is nothing."""
     actuation: Actuation | None
@@ -79,7 +79,8 @@ class GraspData:
             compliance=compliance,
             cone_margin=optional_float("cone_margin", cone_margin),
             actuation=actuation,
-            cone_edges=cone_edges,
+            # Soft contacts have twice as many rows.
+            cone_edges=None if cone_edges is None else cone_edges * (contacts.components - 2),
         )
 
 
@@ -95,7 +96,7 @@ class Options:
     cutoff: Float[Array, "*batch"] | None = None
     """The least margin that is of interest."""
     effort_weights: Float[Array, "..."] | None = None
-    """Q_0 as blocks (*batch, contacts, 3, 3) or full (*batch, 3 contacts, 3 contacts), contact frames; None is the
+    """Q_0 as blocks (*batch, contacts, k, k) or full (*batch, k contacts, k contacts), contact frames; None is the
     identity."""
 
 
@@ -142,14 +143,14 @@ class Trailing:
 
 def trailing_shapes(data: GraspData, options: Options) -> tuple[GraspData, Options]:
     """The shapes that leaves have to end in, as parallel trees; without those of the disturbance set."""
-    n, batch = data.contacts.n_c, data.contacts.batch_shape
+    n, k, batch = data.contacts.n_c, data.contacts.components, data.contacts.batch_shape
     alike = lambda tree, shape: jax.tree.map(lambda _: Trailing(shape), tree)
     actuation: Any = data.actuation
     if actuation is not None:
         joints, actuators = actuation.transmission.shape[-2:]
         actuation = replace(
             actuation,
-            jacobian=Trailing((n, 3, joints)),
+            jacobian=Trailing((n, k, joints)),
             transmission=Trailing((joints, actuators)),
             lower=Trailing((actuators,)),
             upper=Trailing((actuators,)),
@@ -166,7 +167,7 @@ def trailing_shapes(data: GraspData, options: Options) -> tuple[GraspData, Optio
         actuation=actuation,
     )
     weights = options.effort_weights
-    weights = None if weights is None else _matrix_shape("effort_weights", weights, n)
+    weights = None if weights is None else _matrix_shape("effort_weights", weights, n, k)
     option_shapes = replace(alike(options, ()), effort_weights=weights)
     return replace(shapes, cone_margin=_cone_margin_shape(data, options, shapes, option_shapes)), option_shapes
 
@@ -182,6 +183,7 @@ def lay_out(data: GraspData, options: Options) -> Arguments:
     _check_vertices(data)
     _check_jacobian(data)
     shapes, option_shapes = trailing_shapes(data, options)
+    data, options = moments_in_newtons(data, options)
     disturbances = data.disturbances
     batch = broadcast_batch(
         contacts=data.contacts.batch_shape,
@@ -219,6 +221,43 @@ def lay_out(data: GraspData, options: Options) -> Arguments:
     return Arguments(jax.tree.map(lay, inputs, shapes, shared), shared, batch)
 
 
+def moments_in_newtons(data: GraspData, options: Options) -> tuple[GraspData, Options]:
+    """Turn matrices for forces and moments (f_t1, f_t2, f_n, m) into those for (f_t1, f_t2, f_n, m / arm).
+
+    So all components are newtons, and moments count as much as the tangential forces that use up as much friction. That
+    is also what no compliance, or no weights, stand for; MuJoCo's contacts are as stiff. Where a contact bears no
+    moment its fourth row and column are those of the identity.
+    """
+    arms = data.contacts.torsional_arms
+    if arms is None:
+        return data, options
+
+    def turn(matrices: jax.Array, shape: tuple[int, ...], blocks: bool) -> jax.Array:
+        """Turn matrices that end in this shape: blocks by contact, or of all contacts together."""
+        factors = jnp.concatenate([jnp.ones((*arms.shape, 3), arms.dtype), arms[..., None]], -1)
+        own = (*arms.shape[-1:], 4) if blocks else (4 * arms.shape[-1],)
+        directions = (1,) * (len(shape) - len(own) - 1)
+        factors = factors.reshape(*arms.shape[:-1], *directions, *own)
+        idle = jnp.where(factors == 0, 1, 0)[..., None] * jnp.eye(own[-1], dtype=arms.dtype)
+        return matrices.astype(arms.dtype) * factors[..., None] * factors[..., None, :] + idle
+
+    compliance, weights, actuation = data.compliance, options.effort_weights, data.actuation
+    shape = _compliance_shape(data)
+    if isinstance(compliance, Compliance):
+        shape = shape.per_vertex.shape
+        compliance = Compliance(per_vertex=turn(compliance.per_vertex, shape, len(shape) == 4))
+    elif compliance is not None:
+        compliance = turn(compliance, shape.shape, len(shape.shape) == 3)
+    if weights is not None:
+        own = _matrix_shape("effort_weights", weights, data.contacts.n_c, 4).shape
+        weights = turn(weights, own, len(own) == 3)
+    if actuation is not None:
+        jacobian = actuation.jacobian
+        moved = jnp.concatenate([jacobian[..., :3, :], jacobian[..., 3:, :] * arms[..., None, None]], -2)
+        actuation = replace(actuation, jacobian=moved)
+    return replace(data, compliance=compliance, actuation=actuation), replace(options, effort_weights=weights)
+
+
 def _batches(tree: Any, shapes: Any) -> dict[str, tuple[int, ...]]:
     """The batch axes of all leaves, by their public names."""
     leaves, ends = jax.tree_util.tree_flatten_with_path(tree)[0], jax.tree.leaves(shapes)
@@ -242,10 +281,10 @@ def _check_vertices(data: GraspData) -> None:
 
 def _check_jacobian(data: GraspData) -> None:
     """Refuse an actuation for another number of contacts."""
-    n, actuation = data.contacts.n_c, data.actuation
-    if actuation is not None and actuation.jacobian.shape[-3] != n:
+    n, k, actuation = data.contacts.n_c, data.contacts.components, data.actuation
+    if actuation is not None and actuation.jacobian.shape[-3:-1] != (n, k):
         raise ValueError(
-            f"actuation: got a jacobian of shape {actuation.jacobian.shape}, wanted (*batch, {n}, 3, n_v), "
+            f"actuation: got a jacobian of shape {actuation.jacobian.shape}, wanted (*batch, {n}, {k}, n_v), "
             f"one for each of the {n} contacts"
         )
 
@@ -267,31 +306,31 @@ def _compliance_shape(data: GraspData) -> Any:
     Raises:
         ValueError: it ends in neither.
     """
-    n, compliance = data.contacts.n_c, data.compliance
+    n, k, compliance = data.contacts.n_c, data.contacts.components, data.compliance
     if compliance is None:
         return None
     if not isinstance(compliance, Compliance):
-        return _matrix_shape("compliance", compliance, n)
+        return _matrix_shape("compliance", compliance, n, k)
     (vertices,) = data.disturbances.terms
     assert isinstance(vertices, Vertices)
     array, count = compliance.per_vertex, vertices.wrenches.shape[-2]
-    for shape in ((count, n, 3, 3), (count, 3 * n, 3 * n)):
+    for shape in ((count, n, k, k), (count, k * n, k * n)):
         if array.shape[-len(shape) :] == shape:
             return replace(compliance, per_vertex=Trailing(shape))
     raise ValueError(
-        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, 3, 3) or "
-        f"(*batch, {count}, {3 * n}, {3 * n}), one Q for each of the {count} wrenches"
+        f"compliance: got shape {array.shape}, wanted (*batch, {count}, {n}, {k}, {k}) or "
+        f"(*batch, {count}, {k * n}, {k * n}), one Q for each of the {count} wrenches"
     )
 
 
-def _matrix_shape(name: str, matrices: jax.Array, n: int) -> Trailing:
+def _matrix_shape(name: str, matrices: jax.Array, n: int, k: int) -> Trailing:
     """The shape that Q or Q_0 has to end in: blocks of contacts, or all contacts together.
 
     Raises:
         ValueError: it ends in neither.
     """
     array = as_float(name, matrices, ("rows", "columns"))
-    for shape in ((n, 3, 3), (3 * n, 3 * n)):
+    for shape in ((n, k, k), (k * n, k * n)):
         if array.shape[-len(shape) :] == shape:
             return Trailing(shape)
-    raise ValueError(f"{name}: got shape {array.shape}, wanted (*batch, {n}, 3, 3) or (*batch, {3 * n}, {3 * n})")
+    raise ValueError(f"{name}: got shape {array.shape}, wanted (*batch, {n}, {k}, {k}) or (*batch, {k * n}, {k * n})")

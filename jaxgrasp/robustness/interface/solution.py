@@ -1,8 +1,12 @@
 """The solutions of (21) and (22)."""
 
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxgrasp.compiling import compiled
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.records import record
 
@@ -20,7 +24,8 @@ class Solution:
     forces: Float[Array, "*batch contacts 3"]
     """f_0 in contact frames (t1, t2, n), N; 0 for absent contacts, NaN where there is no answer."""
     effort: Float[Array, "*batch"]
-    """1/2 f_0' Q_0 f_0; Q_0 is the identity unless effort weights were given."""
+    """1/2 f_0' Q_0 f_0; Q_0 is the identity unless effort weights were given; moments of soft contacts then count as
+    the forces m mu / gamma."""
     status: Int[Array, "*batch"]
     """`Status` of every grasp."""
     iterations: Int[Array, "*batch"]
@@ -36,7 +41,8 @@ class Solution:
     rank: Int[Array, "*batch"]
     """Rank of the grasp map, of contacts without friction with their normals alone."""
     cone_multipliers: Float[Array, "*batch contacts edges"]
-    """z >= 0 of C f_0 - S_1 lambda <= -d; without friction of rows cos(pi / n_e) f_n, see `largest_disturbance`."""
+    """z >= 0 of C f_0 - S_1 lambda <= -d, 2 n_e of them for soft contacts; without friction of rows cos(pi / n_e) f_n,
+    see `largest_disturbance`."""
     bound_multipliers: Float[Array, "*batch contacts"]
     """z >= 0 of -E f_0 + S_2 lambda <= f_max."""
     wrench_multipliers: Float[Array, "*batch 6"]
@@ -47,6 +53,8 @@ class Solution:
     """z >= 0 of the worst case of u <= u_max and of -u <= -u_min."""
     joint_multipliers: Float[Array, "*batch joints"] | None = None
     """y of J'f_0 - B u = 0."""
+    moments: Float[Array, "*batch contacts"] | None = None
+    """The moments of the fingers on the object about the normals n, right-handed, N m; None for hard contacts."""
 
     def forces_in_object_frame(self, contacts: Contacts) -> Float[Array, "*batch contacts 3"]:
         """Forces of the fingers on the object in the object frame, N.
@@ -56,3 +64,27 @@ class Solution:
         """
         turned = jnp.einsum("...ij,...j->...i", contacts.frames, self.forces)
         return jnp.where(contacts.active[..., None], turned, self.forces)
+
+
+def with_moments(solution: Solution, contacts: Contacts) -> Solution:
+    """Split the forces of soft contacts, whose fourth component is m / arm, into forces and moments."""
+    return solution if contacts.torsional_friction is None else _split(solution, contacts)
+
+
+@compiled
+def _split(solution: Solution, contacts: Contacts) -> Solution:
+    forces, moments = split(solution.forces, contacts)
+    return replace(solution, forces=forces, moments=moments)
+
+
+def split(forces: jax.Array, contacts: Contacts) -> tuple[jax.Array, jax.Array]:
+    """Forces (*batch, n_c, 3), N, and moments (*batch, n_c), N m, of soft contacts; *batch may end in directions.
+
+    Args:
+        forces: (*batch, n_c, 4), the fourth component as m / arm.
+        contacts: the grasps, whose axes broadcast to these.
+    """
+    arms = contacts.torsional_arms
+    assert arms is not None
+    moments = forces[..., 3] * jnp.where(contacts.active, arms, 0)
+    return forces[..., :3], jnp.where(contacts.active, moments, 0)

@@ -40,7 +40,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.friction import contact_facets
 from jaxgrasp.lanes.differentiable import Along, OfPyramids
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.tightening.objectives import LargestMargin, LeastEffort, Objective, apply_weights
@@ -56,12 +56,12 @@ from jaxgrasp.solvers.small_matrices import flatten
 class RowWeights(NamedTuple):
     """Cotangents of what the rows C f + h lambda + d <= 0 and -f_n + h lambda - f_max <= 0 are made of, h = -S_1, S_2.
 
-    cone, bound: (n_e, n, *lanes) and (n, *lanes), of the rows' values.
+    cone, bound: (n_e, n, *lanes), 2 n_e of soft contacts, and (n, *lanes), of the rows' values.
     cone_reach, bound_reach: of h, in the same shapes.
     friction: (n, *lanes), of mu in C.
-    columns: (6, 3, n, *lanes), of the blocks of G, moments as in `Grasps`.
+    columns: (6, k, n, *lanes), of the blocks of G, moments as in `Grasps`.
     wrench: (6, *lanes), of b.
-    weights: (n, 3, 3, *lanes) or (3 n, 3 n, *lanes), of Q_0; None where there is none.
+    weights: (n, k, k, *lanes) or (k n, k n, *lanes), of Q_0; None where there is none.
     margin: (*lanes), of the margin that is asked for; None where none is.
     """
 
@@ -86,7 +86,7 @@ def envelope_adjoint(cone_edges: int, with_terms: bool, grasps: Grasps, point: P
     z_cone, z_bound = -z_cone * weight * grasps.present, -usable(point.bound_multipliers) * weight * grasps.present
     y = usable(point.wrench_multipliers) * weight
     margin = usable(point.margin)
-    normal = literal(pyramid_facets(cone_edges)[:, 2], force.dtype)[:, None, None]
+    normal = literal(contact_facets(cone_edges, len(force))[:, 2], force.dtype)[:, None, None]
     rows = RowWeights(
         cone=z_cone,
         bound=z_bound,
@@ -169,7 +169,7 @@ def is_compact(along: Along) -> bool:
 
 
 class _Units(NamedTuple):
-    """Units of the solver in newtons: of forces (3, n, *lanes), of rows (n_e + 1, n, *lanes), of the objective."""
+    """Units of the solver in newtons: of forces (k, n, *lanes), of rows (m, n, *lanes), of the objective."""
 
     forces: jax.Array
     rows: jax.Array
@@ -204,7 +204,7 @@ def _central_adjoint(
     force, move = jnp.moveaxis(forces, 1, 0), move_x * units.forces
     y = jnp.where(point.usable, point.wrench_multipliers, 0) / grasps.units / unit
     move_y = program.wrench_multipliers(move_y, jnp.ones_like(grasps.units))
-    normal = literal(pyramid_facets(cone_edges)[:, 2], z.dtype)[:, None, None]
+    normal = literal(contact_facets(cone_edges, len(force))[:, 2], z.dtype)[:, None, None]
     asked = None
     if isinstance(objective, LeastEffort):
         # lambda is data, and H = Q_0 / unit in the stationarity of f.

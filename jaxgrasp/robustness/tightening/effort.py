@@ -16,7 +16,7 @@ from jaxgrasp.robustness.auditing.multipliers import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
-from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.interface.solution import Solution, with_moments
 from jaxgrasp.robustness.tightening.decisions import solve_effort, solve_margin
 from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
 from jaxgrasp.robustness.tightening.objectives import LeastEffort
@@ -48,7 +48,7 @@ def least_effort(
         compliance: Q, as in `largest_disturbance`.
         effort_weights: Q_0, contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3) or full
             (*batch, 3 n_c, 3 n_c), for least joint torques `Actuation.joint_torque_weights`; None is the identity.
-            Full ones take dense linear algebra, blocks do not.
+            Full ones take dense linear algebra, blocks do not. For soft contacts 4 in place of 3, as the compliance.
         cone_edges: n_e.
         cone_margin: d, N, >= 0: a grasp, a contact or a row, as in `largest_disturbance`.
         smoothing: kappa (*batch,), > 0, N^2: s z = kappa in every row, as in `largest_disturbance` but in units of the
@@ -80,7 +80,8 @@ def least_effort(
         smoothing=optional_float("smoothing", smoothing),
         effort_weights=optional_float("effort_weights", effort_weights),
     )
-    return over_grasps(_LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)[0]
+    found = over_grasps(_LeastEffort(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)
+    return with_moments(found[0], contacts)
 
 
 class _LeastEffort(Tightening):

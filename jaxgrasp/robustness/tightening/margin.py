@@ -15,7 +15,7 @@ from jaxgrasp.robustness.auditing.multipliers import Evidence
 from jaxgrasp.robustness.auditing.setting import chosen_form
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, optional_float
-from jaxgrasp.robustness.interface.solution import Solution
+from jaxgrasp.robustness.interface.solution import Solution, with_moments
 from jaxgrasp.robustness.tightening.decisions import at_centre, solve_margin
 from jaxgrasp.robustness.tightening.derivatives import envelope_adjoint, is_compact, set_changes
 from jaxgrasp.robustness.tightening.kernel import Tightening, change_of_results
@@ -55,7 +55,8 @@ def largest_disturbance(
         disturbances: the set D; without batch axes it is shared by all grasps.
         required_wrench: b (*batch, 6), N and N m, see `required_wrench`; None is zero.
         compliance: Q of (14), contact frames, symmetric positive definite: blocks (*batch, n_c, 3, 3), full
-            (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity.
+            (*batch, 3 n_c, 3 n_c), or `Compliance.per_direction`; None is the identity. For soft contacts 4 in place of
+            3, with moments fourth (rad/(N m)); None then counts a moment m as the force m mu / gamma.
         cone_edges: n_e, edges of the friction pyramid, which is inscribed in Coulomb's cone.
         cone_margin: d, N, >= 0, what facet rows keep in reserve: one value a grasp (*batch,), a contact (*batch, n_c)
             or a row (*batch, n_c, n_e). Row k is (cos a_k, sin a_k, mu cos(pi/n_e)) f <= -d with a_k = (2 k + 1) pi /
@@ -96,7 +97,8 @@ def largest_disturbance(
         contacts, disturbances, required_wrench, compliance, cone_margin, actuation, cone_edges
     )
     options = Options(smoothing=optional_float("smoothing", smoothing), cutoff=optional_float("cutoff", cutoff))
-    return over_grasps(_LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)[0]
+    found = over_grasps(_LargestDisturbance(cone_edges, smoothing is not None, chosen_form() != "off"), data, options)
+    return with_moments(found[0], contacts)
 
 
 class _LargestDisturbance(Tightening):

@@ -11,7 +11,7 @@ from jax import lax
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import is_full
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.program import ScaledProgram
+from jaxgrasp.robustness.tightening.program import ScaledProgram, force_units
 from jaxgrasp.solvers.block.effort import EffortProblem, curvature_of
 from jaxgrasp.solvers.block.kkt import BlockProblem, Blocks, Rows
 from jaxgrasp.solvers.block.margin import MarginProblem
@@ -44,10 +44,10 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
     dtype, asked = program.rhs.dtype, grasps.options.margin
     assert asked is not None
     margin = jnp.where(program.disturbance_outside, 0, asked / program.scale)
-    eye = jnp.eye(3, dtype=dtype)[..., None, None]
+    eye = jnp.eye(program.columns.shape[1], dtype=dtype)[..., None, None]
     # H = D Q_0 D = root'root with root = R D, Q_0 = R'R and the units D of forces.
     root = eye if grasps.weight_roots is None else grasps.weight_roots
-    units = jnp.stack([program.tangential, program.tangential, program.normal])
+    units = force_units(program.tangential, program.normal, program.columns.shape[1])
     if root.ndim < blocks.columns.ndim:
         root = root * flatten(units * blocks.present)
         largest = fold(jnp.maximum, fold(jnp.maximum, jnp.abs(root)))
@@ -78,7 +78,7 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
 
 
 def apply_weights(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """Q_0 f of forces (n, 3, *lanes), with blocks or a full Q_0; None for the weights is Q_0 = I."""
+    """Q_0 f of forces (n, k, *lanes), with blocks or a full Q_0; None for the weights is Q_0 = I."""
     if weights is None:
         return forces
     if is_full(weights, len(forces)):
@@ -87,7 +87,7 @@ def apply_weights(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
 
 
 def compute_effort(forces: jax.Array, weights: jax.Array | None) -> jax.Array:
-    """1/2 f' Q_0 f of forces (n, 3, *lanes)."""
+    """1/2 f' Q_0 f of forces (n, k, *lanes)."""
     return 0.5 * fold(jnp.add, fold(jnp.add, forces * apply_weights(forces, weights)))
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.tightening.objectives import Objective, compute_effort
-from jaxgrasp.robustness.tightening.program import ScaledProgram, actuated_values
+from jaxgrasp.robustness.tightening.program import ScaledProgram, actuated_values, force_units
 from jaxgrasp.solvers.block.kkt import BlockProblem, adjoint_rows, apply_hessian, apply_rows
 from jaxgrasp.solvers.block.sensitivity import central_point
 from jaxgrasp.solvers.interior_point import Iterate
@@ -79,7 +79,7 @@ def scale_point(
     """
     usable = lambda x, other: jnp.where(point.usable, x, other)
     forces = usable(jnp.moveaxis(point.forces, 1, 0), 0) * program.present
-    x = [forces / jnp.stack([program.tangential, program.tangential, program.normal])]
+    x = [forces / force_units(program.tangential, program.normal, len(forces))]
     z = jnp.concatenate([jnp.moveaxis(point.cone_multipliers, 1, 0), point.bound_multipliers[None]])
     z = [usable(z * program.row_units() / unit, 1) * program.present]
     if program.actuators is not None:

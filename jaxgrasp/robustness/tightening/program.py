@@ -16,7 +16,8 @@ import numpy as np
 from jax import lax
 
 from jaxgrasp.arrays import fold, literal
-from jaxgrasp.contact.friction import pyramid_facets
+from jaxgrasp.contact.contacts import LEAST_FRICTION
+from jaxgrasp.contact.friction import contact_facets
 from jaxgrasp.contact.row_space import RANK_TOLERANCE, Basis, whitened
 from jaxgrasp.lanes.fence import fenced
 from jaxgrasp.robustness.actuators import ActuatorRows, actuator_unit, join_rows, pack, unpack
@@ -25,8 +26,6 @@ from jaxgrasp.robustness.worst_case import RowLosses, reach_outside, worst_rows
 from jaxgrasp.solvers.block.kkt import Blocks, Record, Rows, total
 from jaxgrasp.solvers.interior_point import Iterate
 
-# Friction below this is scaled like this: tangential forces then stay below it in units of f_max, as good as none.
-LEAST_FRICTION = {"float64": 1e-9, "float32": 1e-6}
 # The most that dropping rows may turn those that are kept: as much as rows of an answer may be missed by.
 _MOST_TURNED = 1e-7
 
@@ -55,15 +54,17 @@ class ScaledProgram:
     cone_edges: int = field(metadata={"static": True})
     """n_e."""
     columns: jax.Array
-    """(eq, 3, n, *lanes), the orthonormal equality rows, those of G and of J'f - B u; zero where dropped or absent."""
+    """(eq, k, n, *lanes), the orthonormal equality rows, those of G and of J'f - B u; zero where dropped or absent."""
     sigma: jax.Array
-    """(n_e + 1, n, *lanes), what the disturbances take from the rows of C and E, scaled."""
+    """(m, n, *lanes), what the disturbances take from the rows, scaled; m = n_e + 1, of soft contacts 2 n_e + 1."""
     h: jax.Array
-    """(n_e + 1, n, *lanes), right-hand sides."""
+    """(m, n, *lanes), right-hand sides."""
     present: jax.Array
     """(n, *lanes), 1 or 0."""
     rough: jax.Array
     """(n, *lanes), 1 where there is friction, else 0."""
+    turning: jax.Array | None
+    """(n, *lanes), 1 where a contact bears a moment, else 0; None for hard contacts."""
     rhs: jax.Array
     """(eq, *lanes), coordinates of b in the orthonormal rows; zero where dropped."""
     dropped: jax.Array
@@ -104,8 +105,10 @@ class ScaledProgram:
 
     @property
     def blocks(self) -> Blocks:
-        """Contacts with their rows: n_e facets, then the bound on the normal force."""
-        patterns = np.concatenate([pyramid_facets(self.cone_edges), [[0.0, 0.0, -1.0]]])
+        """Contacts with their rows: the facets, then the bound on the normal force."""
+        components = self.columns.shape[1]
+        bound = np.array([[0.0, 0.0, -1.0, 0.0][:components]])
+        patterns = np.concatenate([contact_facets(self.cone_edges, components), bound])
         return Blocks(
             patterns=literal(patterns, self.h.dtype),
             columns=self.columns,
@@ -113,7 +116,7 @@ class ScaledProgram:
             h=self.h,
             present=self.present,
             hessian_root=None,
-            start=literal(np.array([0.0, 0.0, -0.6]), self.h.dtype),
+            start=literal(0.6 * bound[0], self.h.dtype),
         )
 
     @property
@@ -121,19 +124,20 @@ class ScaledProgram:
         """|x|_inf <= 1 + radius * max(0, -lambda_hat) at the optimum."""
         return 1 + 1 / math.cos(math.pi / self.cone_edges)
 
-    def forces(self, x: jax.Array) -> jax.Array:
-        """Turn scaled forces (3, n, *lanes) into contact forces (n, 3, *lanes), N."""
-        return jnp.swapaxes(x * self.force_units, 0, 1)
-
     @property
     def force_units(self) -> jax.Array:
-        """(3, n, *lanes), N: what scaled forces are worth, nothing along tangents without friction."""
+        """What scaled forces are worth, (k, n, *lanes), N: along the normal F, else mu F, 0 without friction."""
         tangential = self.tangential * self.rough
-        return jnp.stack([tangential, tangential, self.normal])
+        turning = [] if self.turning is None else [self.tangential * self.turning]
+        return jnp.stack([tangential, tangential, self.normal, *turning])
+
+    def forces(self, x: jax.Array) -> jax.Array:
+        """Turn scaled forces (k, n, *lanes) into contact forces (n, k, *lanes), N."""
+        return jnp.swapaxes(x * self.force_units, 0, 1)
 
     def row_units(self) -> jax.Array:
-        """The unit of every scaled row, (n_e + 1, n, *lanes), N."""
-        edges = jnp.broadcast_to(self.tangential, (self.cone_edges, *self.tangential.shape))
+        """The unit of every scaled row, (m, n, *lanes), N."""
+        edges = jnp.broadcast_to(self.tangential, (self.h.shape[0] - 1, *self.tangential.shape))
         return jnp.concatenate([edges, self.normal[None]])
 
     def wrench_multipliers(self, y: jax.Array, units: jax.Array) -> jax.Array:
@@ -156,6 +160,11 @@ class ScaledProgram:
         return fold(jnp.add, [self.basis.operations[:, c] * y[c] for c in range(6)]) * self.basis.kept
 
 
+def force_units(tangential: jax.Array, normal: jax.Array, components: int) -> jax.Array:
+    """The units of the components of contact forces, (k, n, *lanes)."""
+    return jnp.stack([tangential, tangential, normal, tangential][:components])
+
+
 def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
     """Scale the programs of a batch of grasps."""
     present, dtype = grasps.present, grasps.present.dtype
@@ -170,7 +179,7 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
     # Equality rows: in newtons over the mean largest force, then orthonormal. No derivative depends on the mean.
     mean = fold(jnp.add, normal * present) / jnp.maximum(fold(jnp.add, present), 1)
     mean = lax.stop_gradient(jnp.where(mean > 0, mean, 1))
-    scales = jnp.stack([tangential, tangential, normal]) / mean
+    scales = force_units(tangential, normal, grasps.columns.shape[1]) / mean
     equalities = _scale_equalities(grasps, scales, grasps.wrench / mean, None if unit is None else unit / mean)
     wrench = equalities.original.wrench
     actuators = None
@@ -192,6 +201,7 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
         h=rows.h,
         present=present,
         rough=grasps.rough,
+        turning=grasps.turning,
         rhs=coordinates * kept,
         dropped=1 - kept,
         scale=rows.scale,
@@ -214,7 +224,7 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
 class _ScaledRows(NamedTuple):
     """The scaled inequality rows A x + sigma lambda <= h.
 
-    sigma, h: (n_e + 1, n, *lanes), of the contacts.
+    sigma, h: (m, n, *lanes), of the contacts.
     actuator_sigma: (2, n_u, *lanes), of the actuators; None without any.
     scale: (*lanes), Lambda.
     undisturbed: bool (*lanes), sigma = 0.
@@ -266,7 +276,7 @@ def _scale_rows(grasps: Grasps, losses: RowLosses, tangential: jax.Array, unit: 
 class _ScaledEqualities(NamedTuple):
     """The orthonormal equality rows, and where they come from.
 
-    forces: (eq, 3, n, *lanes), columns of the contact forces.
+    forces: (eq, k, n, *lanes), columns of the contact forces.
     actuators: (eq, 1, n_u, *lanes), columns of the actuator efforts; None without any.
     joint_sizes: (n_v, *lanes), what the rows of J'f - B u were divided by; None without actuators.
     basis: row operations from the original rows to the orthonormal ones.
@@ -287,7 +297,7 @@ def _scale_equalities(
 
     Args:
         grasps: the grasps.
-        scales: (3, n, *lanes), units of the forces over their mean.
+        scales: (k, n, *lanes), units of the forces over their mean.
         wrench: (6, *lanes), b over the mean.
         unit: (n_u, *lanes), units of the actuator efforts over the mean of forces; None without actuators.
     """

@@ -1,6 +1,6 @@
 """A quadratic program whose copies of small blocks meet in one of them: the form of (11).
 
-    min 1/2 x_0' H_0 x_0 + sum_j 1/2 (x_j - x_0)' H_j (x_j - x_0)   over x_0, x_1 .. x_J, blocks of three each, with
+    min 1/2 x_0' H_0 x_0 + sum_j 1/2 (x_j - x_0)' H_j (x_j - x_0)   over x_0, x_1 .. x_J, blocks of k each, with
     A x_ji <= h   and   sum_i E_i x_ji = b_j.
 
 The Newton matrix is an arrow: given x_0, the hub, the copies have nothing to do with each other. With the weights W of
@@ -16,7 +16,7 @@ E P_j^-1 E' = L_j L_j' and G_j = L_j^-1 E F_j:
 
     (P_0 - sum_j (H_j F_j - G_j'G_j)) dx_0 + E'dy_0 = r_0 + sum_j (H_j P_j^-1 r_j - G_j'L_j^-1 (E P_j^-1 r_j - q_j)).
 
-The last system, of 3 n unknowns and the equalities of the hub, is solved by inverse Cholesky factors. A step costs
+The last system, of k n unknowns and the equalities of the hub, is solved by inverse Cholesky factors. A step costs
 O(J (n + n^2) + n^3); a dense factorisation would cost O(J^3 n^3). Where H_j ties the blocks together P_j is dense, too,
 and a step costs O(J n^3). H_0 may be full at no cost, since the hub's matrix is.
 
@@ -34,21 +34,19 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.lanes.fence import each, fenced, repeat
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.small_matrices import (
+    SmallFactor,
     block_diagonal,
-    cholesky_3x3,
     flatten,
     inverse_cholesky,
     matmul,
     matvec,
     matvec_transposed,
-    solve_3x3,
+    small_cholesky,
+    solve_small,
     spread_over,
     sum_over_blocks,
     unflatten,
 )
-
-# The entries of a symmetric 3x3 matrix that `cholesky_3x3` takes.
-_PAIRS = [(a, b) for a in range(3) for b in range(a + 1)]
 
 
 class ArrowRecord(NamedTuple):
@@ -65,38 +63,38 @@ class ArrowRecord(NamedTuple):
 class _Factors(NamedTuple):
     """The reduced Newton system, in the letters of the module's docstring."""
 
-    # Cholesky factors of the 3x3 blocks of P_j, (n, J, *lanes), or one of a dense P_j, (3 n, 3 n, J, *lanes), inverted.
-    copies: list[jax.Array] | jax.Array
+    # Cholesky factors of the blocks of P_j, (n, J, *lanes), or one of a dense P_j, (k n, k n, J, *lanes), inverted.
+    copies: SmallFactor | jax.Array
     follow: jax.Array  # F_j, like H_j
     roots: jax.Array  # (eq, eq, J, *lanes), L_j^-1
-    reach: jax.Array  # (eq, 3, n, J, *lanes), G_j
-    hub: jax.Array  # (3 n, 3 n, *lanes), K, the inverse Cholesky factor of the matrix of dx_0
+    reach: jax.Array  # (eq, k, n, J, *lanes), G_j
+    hub: jax.Array  # (k n, k n, *lanes), K, the inverse Cholesky factor of the matrix of dx_0
     hub_root: jax.Array  # (eq, eq, *lanes), the inverse Cholesky factor of E K'K E'
-    hub_columns: jax.Array  # (eq, 3 n, *lanes), E K'
+    hub_columns: jax.Array  # (eq, k n, *lanes), E K'
     weights: jax.Array
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True)
 class ArrowProblem:
-    """The program for `interior_point.solve`; x is (3, n, J + 1, *lanes), x_0 last, rows (m, n, J + 1, *lanes)."""
+    """The program for `interior_point.solve`; x is (k, n, J + 1, *lanes), x_0 last, rows (m, n, J + 1, *lanes)."""
 
     patterns: jax.Array
-    """The rows A, (m, 3)."""
+    """The rows A, (m, k)."""
     h: jax.Array
     """The right-hand sides of the rows, (m, 1 or n, 1, *1 or *lanes)."""
     columns: jax.Array
-    """E, (eq, 3, n, 1, *lanes); zero where a row is dropped or a block absent."""
+    """E, (eq, k, n, 1, *lanes); zero where a row is dropped or a block absent."""
     rhs: jax.Array
     """The right-hand sides b_j of the equality rows, (eq, J + 1, *lanes)."""
     dropped: jax.Array
     """A mask of the equality rows, (eq, 1, *lanes): 1 for rows that are zero, else 0."""
     hub_hessian: jax.Array
-    """H_0: its blocks, (3, 3, n, 1, *lanes), or a full matrix, (3 n, 3 n, 1, *lanes), block by block."""
+    """H_0: its blocks, (k, k, n, 1, *lanes), or a full matrix, (k n, k n, 1, *lanes), block by block."""
     copy_hessian: jax.Array
-    """H_j: blocks, (3, 3, n, J or 1, *lanes), or full matrices, (3 n, 3 n, J or 1, *lanes); 1 where all are one."""
+    """H_j: blocks, (k, k, n, J or 1, *lanes), or full matrices, (k n, k n, J or 1, *lanes); 1 where all are one."""
     guess: jax.Array
-    """A point to start from, (3, n, J + 1, *lanes): inside the rows, if possible."""
+    """A point to start from, (k, n, J + 1, *lanes): inside the rows, if possible."""
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -118,7 +116,7 @@ class ArrowProblem:
         return matvec_transposed(spread_over(self.patterns.T, x), x)
 
     def adjoint(self, z: jax.Array) -> jax.Array:
-        """Compute A'z, (3, n, J + 1, *lanes)."""
+        """Compute A'z, (k, n, J + 1, *lanes)."""
         return matvec_transposed(spread_over(self.patterns, z), z)
 
     def equality(self, x: jax.Array) -> jax.Array:
@@ -126,7 +124,7 @@ class ArrowProblem:
         return sum_over_blocks(self.columns * x)
 
     def pull_back(self, y: jax.Array) -> jax.Array:
-        """Compute E'y, (3, n, J + 1, *lanes)."""
+        """Compute E'y, (k, n, J + 1, *lanes)."""
         return fold(jnp.add, self.columns * y[:, None, None])
 
     def project(self, x: jax.Array) -> jax.Array:
@@ -161,7 +159,7 @@ class ArrowProblem:
 
     def factor(self, weights: jax.Array) -> _Factors:
         """Factor the Newton system: eliminate the copies' blocks, their equalities, then x_0."""
-        eq, _, n = self.columns.shape[:3]
+        eq, size = self.columns.shape[0], self.columns.shape[1] * self.columns.shape[2]
         if self.copy_hessian.ndim == self.guess.ndim:
             factors, follow, matrix, across, hub = self._eliminate_coupled_copies(weights)
         else:
@@ -174,7 +172,7 @@ class ArrowProblem:
         @fenced
         def couple(roots: jax.Array, across: jax.Array, hub: jax.Array) -> tuple:
             reach = jnp.stack([fold(jnp.add, root[:, None, None] * across) for root in roots])
-            flat = jnp.swapaxes(reach, 1, 2).reshape(eq, 3 * n, -1, *self.lanes)
+            flat = jnp.swapaxes(reach, 1, 2).reshape(eq, size, -1, *self.lanes)
             whole = jnp.einsum("epj...,eqj...->pq...", flat, flat)
             whole = whole + (hub if hub.ndim == whole.ndim else block_diagonal(hub))
             if self.hub_hessian.ndim == self.guess.ndim:
@@ -188,7 +186,7 @@ class ArrowProblem:
 
         @fenced
         def tie(inverse: jax.Array) -> tuple:
-            columns = jnp.swapaxes(self.columns[:, :, :, 0], 1, 2).reshape(eq, 3 * n, *self.lanes)
+            columns = jnp.swapaxes(self.columns[:, :, :, 0], 1, 2).reshape(eq, size, *self.lanes)
             turned = jnp.einsum("ep...,qp...->eq...", columns, inverse)
             return turned, jnp.einsum("ep...,fp...->ef...", turned, turned)
 
@@ -209,11 +207,12 @@ class ArrowProblem:
 
         The last one comes in blocks.
         """
-        eq, pairs = len(self.columns), _PAIRS
+        eq, k = self.columns.shape[:2]
+        pairs = _pairs(k)
         grams = self._grams(weights)
-        factors = cholesky_3x3([g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
-        follow = jnp.stack([solve_3x3(factors, self.copy_hessian[:, b]) for b in range(3)], 1)
-        solved = jnp.stack([solve_3x3(factors, self.columns[r]) for r in range(eq)])
+        factors = small_cholesky([g[:, :-1] + self.copy_hessian[a, b] for g, (a, b) in zip(grams, pairs, strict=True)])
+        follow = jnp.stack([solve_small(factors, self.copy_hessian[:, b]) for b in range(k)], 1)
+        solved = jnp.stack([solve_small(factors, self.columns[r]) for r in range(eq)])
         matrix = jnp.stack([sum_over_blocks(self.columns * solved[r]) for r in range(eq)])
         across = fold(jnp.add, jnp.moveaxis(self.columns[:, :, None] * follow, 1, 0))
         hub = _symmetric(grams)[:, :, :, -1:]
@@ -235,7 +234,7 @@ class ArrowProblem:
             turned = each(lambda column: matvec(roots, column), jax.vmap(flatten)(self.columns))
             matrix = each(lambda row: fold(jnp.add, jnp.moveaxis(turned * row, 1, 0)), turned)
             across = each(lambda row: matvec_transposed(pulled, row), turned)
-            return matrix, jax.vmap(lambda x: unflatten(x, 3))(across)
+            return matrix, jax.vmap(lambda x: unflatten(x, self.columns.shape[1]))(across)
 
         matrix, across = reduce(roots, pulled)
         remainder = self.copy_hessian - matmul(jnp.swapaxes(pulled, 0, 1), pulled)
@@ -245,13 +244,13 @@ class ArrowProblem:
         return roots, follow, matrix, across, block_diagonal(hub) + jnp.sum(remainder, 2)
 
     def _grams(self, weights: jax.Array) -> list[jax.Array]:
-        """Compute the entries `_PAIRS` of the blocks of A'W A, (n, J + 1, *lanes) each."""
-        squares = [self.patterns[:, a] * self.patterns[:, b] for a, b in _PAIRS]
+        """Compute the entries `_pairs` of the blocks of A'W A, (n, J + 1, *lanes) each."""
+        squares = [self.patterns[:, a] * self.patterns[:, b] for a, b in _pairs(self.patterns.shape[1])]
         return [fold(jnp.add, spread_over(square, weights) * weights) for square in squares]
 
     def solve(self, factors: _Factors, residuals: Residuals, shift: jax.Array) -> tuple:
         """Solve the Newton system with dz = shift + weights * A dx for the directions (dx, dy, A dx)."""
-        n = self.columns.shape[2]
+        k, n = self.columns.shape[1:3]
 
         @fenced
         def newton(rhs: jax.Array, rhs_y: jax.Array) -> tuple:
@@ -262,12 +261,12 @@ class ArrowProblem:
             # The hub: its right-hand side, then dy_0 and dx_0.
             push = fold(jnp.add, factors.reach * root_y[:, None, None])
             right = rhs[:, :, -1:] + _sum_copies(_times(self.copy_hessian, first) - push)
-            flat = jnp.swapaxes(right[:, :, 0], 0, 1).reshape(3 * n, *self.lanes)
+            flat = jnp.swapaxes(right[:, :, 0], 0, 1).reshape(k * n, *self.lanes)
             root_right = matvec(factors.hub, flat)
             hub_y = matvec(factors.hub_root, matvec(factors.hub_columns, root_right) - rhs_y[:, -1])
             hub_y = matvec_transposed(factors.hub_root, hub_y)
             hub = matvec_transposed(factors.hub, root_right - matvec_transposed(factors.hub_columns, hub_y))
-            hub = jnp.swapaxes(hub.reshape(n, 3, *self.lanes), 0, 1)[:, :, None]
+            hub = jnp.swapaxes(hub.reshape(n, k, *self.lanes), 0, 1)[:, :, None]
 
             # Back to the copies: dy_j and dx_j.
             copies_y = matvec_transposed(factors.roots, root_y + sum_over_blocks(factors.reach * hub))
@@ -332,35 +331,42 @@ def build_rows(facets: np.ndarray, dtype: jnp.dtype, axes: int) -> tuple[jax.Arr
     """Build the rows A x <= h of friction facets and of a bound on the pushing force.
 
     Args:
-        facets: (m - 1, 3), the facets' normals.
+        facets: (m - 1, k), the facets' normals.
         dtype: precision.
         axes: how many axes follow the rows.
 
     Returns:
-        A, (m, 3), and h, (m, *1).
+        A, (m, k), and h, (m, *1).
     """
-    rows = literal(np.concatenate([facets, [[0.0, 0.0, -1.0]]]), dtype)
+    bound = np.array([[0.0, 0.0, -1.0, 0.0][: facets.shape[1]]])
+    rows = literal(np.concatenate([facets, bound]), dtype)
     return rows, literal(np.array([0.0] * len(facets) + [1.0]), dtype).reshape(-1, *[1] * axes)
 
 
+def _pairs(k: int) -> list[tuple[int, int]]:
+    """The entries of a symmetric k x k matrix that `small_cholesky` takes."""
+    return [(a, b) for a in range(k) for b in range(a + 1)]
+
+
 def _symmetric(entries: list[jax.Array]) -> jax.Array:
-    """Build symmetric blocks (3, 3, ...) of their entries `_PAIRS`."""
-    full = [entries[_PAIRS.index((max(a, b), min(a, b)))] for a in range(3) for b in range(3)]
-    return jnp.stack(full).reshape(3, 3, *full[0].shape)
+    """Build symmetric blocks (k, k, ...) of their entries `_pairs`."""
+    k = round((2 * len(entries)) ** 0.5 - 0.5)
+    full = [entries[_pairs(k).index((max(a, b), min(a, b)))] for a in range(k) for b in range(k)]
+    return jnp.stack(full).reshape(k, k, *full[0].shape)
 
 
 def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
-    """Multiply blocks, (3, 3, n, ...), or full matrices, (3 n, 3 n, ...), by x (3, n, ...)."""
+    """Multiply blocks, (k, k, n, ...), or full matrices, (k n, k n, ...), by x (k, n, ...)."""
     if matrix.ndim > x.ndim:
         return matvec(matrix, x)
-    return unflatten(matvec(matrix, flatten(x)), 3)
+    return unflatten(matvec(matrix, flatten(x)), len(x))
 
 
-def _solve_copies(factors: list[jax.Array] | jax.Array, rhs: jax.Array) -> jax.Array:
-    """Compute P_j^-1 rhs, (3, n, J, *lanes), with factors of blocks or of dense matrices."""
-    if isinstance(factors, list):
-        return solve_3x3(factors, rhs)
-    return unflatten(matvec_transposed(factors, matvec(factors, flatten(rhs))), 3)
+def _solve_copies(factors: SmallFactor | jax.Array, rhs: jax.Array) -> jax.Array:
+    """Compute P_j^-1 rhs, (k, n, J, *lanes), with factors of blocks or of dense matrices."""
+    if isinstance(factors, SmallFactor):
+        return solve_small(factors, rhs)
+    return unflatten(matvec_transposed(factors, matvec(factors, flatten(rhs))), len(rhs))
 
 
 def _sum_copies(x: jax.Array, axis: int = 2) -> jax.Array:

@@ -12,6 +12,8 @@ from jaxgrasp.solvers.small_matrices import (
     matvec,
     matvec_transposed,
     orthonormalise,
+    substitute_down,
+    substitute_up,
     unflatten,
 )
 
@@ -19,7 +21,7 @@ from jaxgrasp.solvers.small_matrices import (
 class BlockFactor(NamedTuple):
     """The Cholesky factor L of P, and solutions with it; lists run over the k unknowns of a block."""
 
-    below: list[jax.Array]  # L10, L20, L21, each (n, *lanes)
+    below: list[jax.Array]  # L10, L20, L21 .., each (n, *lanes)
     inverse: list[jax.Array]  # 1 / diag(L), each (n, *lanes)
     columns: list[jax.Array]  # L^-1 E', each (eq, n, *lanes)
     theta: list[jax.Array]  # L^-1 p, each (n, *lanes)
@@ -38,26 +40,6 @@ class CoupledFactor(NamedTuple):
 Factor = BlockFactor | CoupledFactor
 
 
-def substitute_down(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
-    """Compute L^-1 rhs for k <= 3; lists run over the unknowns."""
-    out: list[jax.Array] = []
-    for i, entry in enumerate(rhs):
-        for j in range(i):
-            entry = entry - below[i * (i - 1) // 2 + j] * out[j]
-        out.append(entry * inverse[i])
-    return out
-
-
-def _substitute_up(below: list[jax.Array], inverse: list[jax.Array], rhs: list[jax.Array]) -> list[jax.Array]:
-    """Compute L^-T rhs for k <= 3; lists run over the unknowns."""
-    out = list(rhs)
-    for i in reversed(range(len(rhs))):
-        for j in range(i + 1, len(rhs)):
-            out[i] = out[i] - below[j * (j - 1) // 2 + i] * out[j]
-        out[i] = out[i] * inverse[i]
-    return out
-
-
 def solve_lower(factor: Factor, rhs: jax.Array) -> list[jax.Array]:
     """Compute L^-1 rhs for rhs (k, n, *lanes): a list over k, or one entry where blocks are tied together."""
     if isinstance(factor, CoupledFactor):
@@ -69,7 +51,7 @@ def solve_upper(factor: Factor, rhs: list[jax.Array], k: int) -> jax.Array:
     """Compute L^-T rhs, (k, n, *lanes), of what `solve_lower` returns."""
     if isinstance(factor, CoupledFactor):
         return unflatten(matvec_transposed(factor.inverse, rhs[0]), k)
-    return jnp.stack(_substitute_up(factor.below, factor.inverse, rhs))
+    return jnp.stack(substitute_up(factor.below, factor.inverse, rhs))
 
 
 def couple(apart: BlockFactor, root: jax.Array, columns: jax.Array) -> CoupledFactor:

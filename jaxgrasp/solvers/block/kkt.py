@@ -1,6 +1,6 @@
 """Programs of small blocks with constant row patterns, tied by a few equalities and one border column.
 
-With blocks x_i (three forces of a contact, or one bounded actuator effort), a scalar lambda and rows
+With blocks x_i (three or four forces of a contact, or one bounded actuator effort), a scalar lambda and rows
 
     A x_i + sigma_i lambda <= h_i      for every block i,
     sum_i E_i x_i = b                  (a static number of equality rows),
@@ -47,7 +47,7 @@ import jax.numpy as jnp
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import each, fenced
-from jaxgrasp.solvers.block.factors import BlockFactor, Factor, couple, solve_lower, solve_upper, substitute_down
+from jaxgrasp.solvers.block.factors import BlockFactor, Factor, couple, solve_lower, solve_upper
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.small_matrices import (
     flatten,
@@ -55,6 +55,7 @@ from jaxgrasp.solvers.small_matrices import (
     matvec,
     matvec_transposed,
     spread_over,
+    substitute_down,
     unflatten,
 )
 
@@ -62,9 +63,10 @@ Rows = tuple[jax.Array, ...]
 
 
 class Blocks(NamedTuple):
-    """A group of n blocks of k unknowns, each with the same m rows A; lanes trail.
+    """A group of n blocks of k <= 4 unknowns, each with the same m rows A; lanes trail.
 
-    patterns: the rows A, (m, k); the last one opposes the sum of the others, so that positive multipliers balance.
+    patterns: the rows A, (m, k); the last one, of the unknown `bounded` alone, opposes the sum of the others, so that
+        positive multipliers balance.
     columns: E_i, (eq, k, n, *lanes); zero where a block is absent.
     sigma: the column of lambda, (m, n, *lanes), >= 0; zero where a block is absent.
     h: the right-hand sides, (m, n, *lanes); one where a block is absent.
@@ -81,6 +83,11 @@ class Blocks(NamedTuple):
     present: jax.Array
     hessian_root: jax.Array | None
     start: jax.Array
+
+    @property
+    def bounded(self) -> int:
+        """The unknown that the last row bounds: the third, or the last of fewer."""
+        return min(self.patterns.shape[1], 3) - 1
 
     @property
     def root(self) -> jax.Array:

@@ -78,8 +78,12 @@ class MarginProblem(BlockProblem):
             s, z = [], []
             for g, slack in zip(self.groups, slacks, strict=True):
                 slack = jnp.where(g.present > 0, jnp.maximum(slack, floor), 1)
+                along = slice(g.bounded, g.bounded + 1)
                 balance = jnp.concatenate(
-                    [jnp.ones(slack.shape[0] - 1, slack.dtype), -jnp.sum(g.patterns[:-1, -1:], 0) / g.patterns[-1, -1:]]
+                    [
+                        jnp.ones(slack.shape[0] - 1, slack.dtype),
+                        -jnp.sum(g.patterns[:-1, along], 0) / g.patterns[-1, along],
+                    ]
                 )
                 mean = fold(jnp.add, slack[:-1]) / (slack.shape[0] - 1)
                 s.append(slack)

@@ -11,7 +11,7 @@ for its residuals r and for the constants (c, b, h), which dtau multiplies. Subs
     [ phi'P     sigma'W^-2 sigma  w' ] [dlambda] = [ r_lambda - sigma'W^-2 u ]
     [ E         w                 0  ] [dy     ]   [ r_y                     ]
 
-with P = A'W^-2 A, of 3x3 blocks, and phi = P^-1 A'W^-2 sigma. The blocks are eliminated first, then the equalities by
+with P = A'W^-2 A, of k x k blocks, and phi = P^-1 A'W^-2 sigma. The blocks are eliminated first, then the equalities by
 M = E P^-1 E' and v = w - E phi, then lambda, whose pivot is
 
     |W^-1 (sigma - A phi)|^2 + v'M^-1 v.
@@ -32,12 +32,13 @@ from jaxgrasp.solvers.conic import cones
 from jaxgrasp.solvers.conic.cones import Scaling
 from jaxgrasp.solvers.conic.margin import ConicMargin, Parts, inner
 from jaxgrasp.solvers.small_matrices import (
-    cholesky_3x3,
+    SmallFactor,
     inverse_cholesky,
     matvec,
     matvec_transposed,
-    solve_3x3,
-    solve_lower_3x3,
+    small_cholesky,
+    solve_lower,
+    solve_small,
     sum_over_blocks,
 )
 
@@ -48,8 +49,8 @@ _REFINEMENTS = 1
 class Factors(NamedTuple):
     """The reduced Newton system, in the letters of the module's docstring."""
 
-    blocks: list[jax.Array]  # Cholesky factors of the 3x3 blocks of P
-    phi: jax.Array  # (3, n, *lanes)
+    blocks: SmallFactor  # Cholesky factors of the k x k blocks of P
+    phi: jax.Array  # (k, n, *lanes)
     root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of M
     v: jax.Array  # (eq, *lanes)
     pivot: jax.Array  # (*lanes), of lambda
@@ -62,17 +63,17 @@ def factor(problem: ConicMargin, scalings: tuple[Scaling, ...]) -> Factors:
     @fenced
     def blocks(scalings: tuple[Scaling, ...]) -> tuple:
         grams = [part.gram(w) for part, w in zip(problem.rows, scalings, strict=True)]
-        lower = cholesky_3x3([fold(jnp.add, list(entries)) for entries in zip(*grams, strict=True)])
+        lower = small_cholesky([fold(jnp.add, list(entries)) for entries in zip(*grams, strict=True)])
         sigma = tuple(part.sigma for part in problem.rows)
         weighed = tuple(cones.weigh(w, v) for w, v in zip(scalings, sigma, strict=True))
-        return lower, solve_3x3(lower, problem.adjoint(weighed)[0])
+        return lower, solve_small(lower, problem.adjoint(weighed)[0])
 
     lower, phi = blocks(scalings)
 
     # Equalities: M = E P^-1 E' and v = w - E phi.
     @fenced
-    def equalities(lower: list[jax.Array], phi: jax.Array) -> tuple:
-        reduced = solve_lower_3x3(lower, jnp.moveaxis(problem.columns, 1, 0))
+    def equalities(lower: SmallFactor, phi: jax.Array) -> tuple:
+        reduced = solve_lower(lower, jnp.moveaxis(problem.columns, 1, 0))
         matrix = jnp.stack(
             [sum_over_blocks(jnp.swapaxes(reduced * reduced[:, r][:, None], 0, 1)) for r in range(len(problem.rhs))]
         )
@@ -115,13 +116,13 @@ def newton(
     # Substitute: P x + P phi lambda + E'y = rhs_x, then M y - v lambda = E P^-1 rhs_x - rhs_y, then lambda alone.
     @fenced
     def substitute(right: jax.Array, right_lam: jax.Array, rhs_y: jax.Array) -> tuple:
-        first = solve_3x3(factors.blocks, right)
+        first = solve_small(factors.blocks, right)
         root_y = matvec(factors.root, sum_over_blocks(problem.columns * first) - rhs_y)
         root_v = matvec(factors.root, factors.v)
         lam = right_lam - fold(jnp.add, fold(jnp.add, factors.phi * right)) - fold(jnp.add, root_v * root_y)
         lam = lam / jnp.maximum(factors.pivot, jnp.finfo(lam.dtype).tiny)
         y = matvec_transposed(factors.root, root_y + root_v * lam)
-        x = first - factors.phi * lam - solve_3x3(factors.blocks, problem.pull_back(y))
+        x = first - factors.phi * lam - solve_small(factors.blocks, problem.pull_back(y))
         return x, lam, y
 
     @fenced

@@ -1,12 +1,12 @@
 """max lambda over small blocks with cone rows in many copies.
 
-With blocks x_i of three unknowns, a scalar lambda, and for every block the same rows in J copies,
+With blocks x_i of k unknowns, a scalar lambda, and for every block the same rows in J copies,
 
     h - A x_i - sigma_ij lambda in K      for every block i and copy j = 1 .. J,
     sum_i E_i x_i + w lambda = b          (a few equality rows),
 
 where K is a product of orthants and second-order cones. `embedding.solve` solves it. All copies of a block's rows have
-the same x_i, so they only add up in its 3x3 matrix, and a step costs O(n (J + 1)).
+the same x_i, so they only add up in its k x k matrix, and a step costs O(n (J + 1)).
 
 Callers scale: |x| <= 1 at admissible points with lambda >= 0, rows of E orthonormal or zero, sigma or w about 1.
 """
@@ -36,23 +36,23 @@ class ConeRows:
     second_order: bool = field(metadata={"static": True})
     """Whether the rows of a block and copy are one second-order cone, or an orthant."""
     patterns: tuple[tuple[float, ...], ...] = field(metadata={"static": True})
-    """The rows A, (d, 3)."""
+    """The rows A, (d, k)."""
     h: tuple[float, ...] = field(metadata={"static": True})
     """The right-hand sides h, (d,)."""
     sigma: jax.Array
     """The column of lambda, (d, J, n, *lanes); zero where a block is absent."""
     stretch: jax.Array | None = None
-    """Factors of the columns of A, (3, n, *lanes); None for 1."""
+    """Factors of the columns of A, (k, n, *lanes); None for 1."""
     reserve: jax.Array | None = None
     """What is taken from h, which all copies share: (d, 1, n, *lanes); None for nothing."""
 
     def apply(self, x: jax.Array) -> jax.Array:
-        """Compute A x, which all copies share: (3, n, *lanes) -> (d, 1, n, *lanes)."""
+        """Compute A x, which all copies share: (k, n, *lanes) -> (d, 1, n, *lanes)."""
         x = x if self.stretch is None else self.stretch * x
         return matvec_transposed(spread_over(self._matrix().T, x), x)[:, None]
 
     def adjoint(self, z: jax.Array) -> jax.Array:
-        """Compute A'z, summed over copies: (d, J, n, *lanes) -> (3, n, *lanes)."""
+        """Compute A'z, summed over copies: (d, J, n, *lanes) -> (k, n, *lanes)."""
         z = along(jnp.add, jnp.moveaxis(z, 1, 0))
         pulled = matvec_transposed(spread_over(self._matrix(), z), z)
         return pulled if self.stretch is None else self.stretch * pulled
@@ -64,9 +64,9 @@ class ConeRows:
         return h if self.reserve is None else h - self.reserve
 
     def gram(self, w: Scaling) -> list[jax.Array]:
-        """Compute the entries 00, 10, 11, 20, 21, 22 of A'W^-2 A summed over copies, (n, *lanes) each."""
-        pairs = [(a, b) for a in range(3) for b in range(a + 1)]
+        """Compute the entries 00, 10, 11, 20, 21, 22, .. of A'W^-2 A summed over copies, (n, *lanes) each."""
         rows = np.array(self.patterns)
+        pairs = [(a, b) for a in range(rows.shape[1]) for b in range(a + 1)]
         if w.size is None:
             weights = along(jnp.add, jnp.moveaxis(1 / (w.point * w.point), 1, 0))
             table = literal(np.stack([rows[:, a] * rows[:, b] for a, b in pairs], 1), weights.dtype)
@@ -95,7 +95,7 @@ class ConicMargin:
 
     rows: tuple[ConeRows, ...]
     columns: jax.Array
-    """E, (eq, 3, n, *lanes); zero where a row is dropped or a block absent."""
+    """E, (eq, k, n, *lanes); zero where a row is dropped or a block absent."""
     border: jax.Array
     """The column w of lambda in the equality rows, (eq, *lanes)."""
     rhs: jax.Array
@@ -108,7 +108,7 @@ class ConicMargin:
         return sum_over_blocks(self.columns * x) + self.border * lam
 
     def pull_back(self, y: jax.Array) -> jax.Array:
-        """Compute E'y, (3, n, *lanes)."""
+        """Compute E'y, (k, n, *lanes)."""
         return fold(jnp.add, self.columns * y[:, None, None])
 
     def apply(self, x: jax.Array, lam: jax.Array) -> Parts:
@@ -116,7 +116,7 @@ class ConicMargin:
         return tuple(part.apply(x) + part.sigma * lam for part in self.rows)
 
     def adjoint(self, z: Parts) -> tuple[jax.Array, jax.Array]:
-        """Compute A'z, (3, n, *lanes), and sigma'z, (*lanes)."""
+        """Compute A'z, (k, n, *lanes), and sigma'z, (*lanes)."""
         pulled = fold(jnp.add, [part.adjoint(z_p) for part, z_p in zip(self.rows, z, strict=True)])
         return pulled, inner([part.sigma for part in self.rows], z)
 
@@ -130,7 +130,7 @@ class ConicMargin:
 
 
 class ConicPoint(NamedTuple):
-    """A point x (3, n, *lanes), lambda (*lanes), and multipliers y (eq, *lanes) and z, parts (d, J, n, *lanes)."""
+    """A point x (k, n, *lanes), lambda (*lanes), and multipliers y (eq, *lanes) and z, parts (d, J, n, *lanes)."""
 
     x: jax.Array
     margin: jax.Array
