@@ -51,9 +51,8 @@ def weighted_pseudo_inverse(
 
     G* W are the contact forces that supply the wrench W with the least f' Q f; contacts without friction have normal
     forces alone, so their tangents have no columns in G and Q here and rows of 0 in G*. On a rank-deficient grasp that
-    holds for wrenches in the range of G; of others G* takes the part in the range, projected with moments in units of
-    the root-mean-square distance of the contacts from the centre of mass. Soft contacts have four rows each, the fourth
-    for the moment about the normal, N m.
+    holds for wrenches in the range of G, G G* G = G; what G* makes of others is not their nearest part there. Soft
+    contacts have four rows each, the fourth for the moment about the normal, N m.
 
     Args:
         contacts: the grasps.
