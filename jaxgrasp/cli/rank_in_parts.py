@@ -37,9 +37,17 @@ _TOLD = 3
 class GivenFiles:
     """The files on the command line, by what they declare."""
 
-    def __init__(self, setting: "Setting", sources: "Sequence[Source]", skipped: Skipped, keep_going: bool):
-        """Takes what is asked, the files, and who is told of those that are passed over."""
+    def __init__(
+        self,
+        setting: "Setting",
+        sources: "Sequence[Source]",
+        skipped: Skipped,
+        keep_going: bool,
+        files: Sequence[str],
+    ):
+        """Takes what is asked, what the files declare, who is told of those that are passed over, and their names."""
         self.setting, self.sources, self.skipped, self.keep_going = setting, tuple(sources), skipped, keep_going
+        self.files = files
         self.rows = sum(source.rows for source in sources)
 
     @classmethod
@@ -63,7 +71,7 @@ class GivenFiles:
             sources = sources_of(files, setting.given, skipped if going else None, progress)
         if not sources:
             raise CommandError(f"{', '.join(command.files)}: none of {len(files):,} files can be used")
-        return cls(setting, sources, skipped, going)
+        return cls(setting, sources, skipped, going, files)
 
     def folder(self, command: RankOptions) -> Path | None:
         """The folder that the ranking goes to; None where it is a table.
@@ -95,7 +103,7 @@ class GivenFiles:
         from jaxgrasp.ranking.streams.sources import is_url
 
         if not self.keep_going and all(s.kind == "npz" and not is_url(s.path) for s in self.sources):
-            return read_candidates([source.name for source in self.sources], **vars(self.setting.given))
+            return read_candidates(self.files, **vars(self.setting.given))
         size = sum(source.rows * source.row_size for source in self.sources)
         if size > allowance():
             raise CommandError(f"{self.rows:,} candidates: take {size / 2**30:.3g} GiB; wanted --run FOLDER")

@@ -160,7 +160,7 @@ def check_total_effort(count: int, kinds: tuple[str, str], dtype=jnp.float64, mo
 def agree(found: jg.TotalEffortSolution, truth, weights, batch: chain.Batch, lanes, most: float) -> None:
     count = len(batch)
     unit = 1e-3 * np.abs(weights).reshape(count, -1).max(-1) * batch.max_force.max(-1) ** 2
-    assert np.max(np.abs(found.effort - truth)[lanes] / np.maximum(truth, unit)[lanes]) <= most
+    assert np.max(np.abs(np.asarray(found.effort) - truth)[lanes] / np.maximum(truth, unit)[lanes]) <= most
 
 
 def small_sample() -> tuple[chain.Batch, np.ndarray, np.ndarray]:
@@ -377,4 +377,4 @@ def test_gradients_of_11(kinds):
         return jnp.where(some, found.lower_bound, jnp.nan)[:, None]
 
     # Of the two bounds, which both vary as the effort does, the lower one is the closer: within 1e-9 as a rule.
-    check_gradients(values, [inputs(batch, Q=Q, weights=weights)], 1e-4, 2e-6, 0.6)
+    check_gradients(values, [inputs(batch, Q=Q, weights=weights)], 4e-4, 2e-6, 0.6)
