@@ -1,4 +1,4 @@
-"""What margins cost as the disturbance set has more directions, beyond S_1 and S_2: `python -m benchmarks.directions`.
+"""The cost of margins, beyond S_1 and S_2, for sets with more and more directions: `python -m benchmarks.directions`.
 
 Writes directions.md beside this file. `--quick` prints two numbers of directions in float64.
 """
@@ -24,7 +24,7 @@ from benchmarks.suite.clock import say, warn_if_busy  # noqa: E402
 BATCH, CONTACTS, ROUNDS = 4096, 4, 40
 SHARED = (6, 16, 64, 128, 256, 512, 1024, 2048, 4096)
 OWN = (6, 64, 256, 1024)
-"""Of sets that each grasp has for itself: 1,024 directions are 200 MB in float64."""
+"""Numbers of directions for sets of each grasp's own; 1,024 are 200 MB in float64."""
 
 Call = Callable[[], object]
 

@@ -32,12 +32,12 @@ GAMMA = 0.02
 PAIRS, NEAR = 100, 0.05
 """Grasps that MuJoCo is asked about, and by how much the moment is less and more than they should bear."""
 SECONDS, LOST = 4.0, (0.2, 0.01)
-"""How long it is applied, and the angle in radians and the way in metres at which the box is lost."""
+"""Seconds that the moment acts, and the angle (rad) and distance (m) beyond which the box counts as lost."""
 BATCH, ROUNDS = 16_384, 9
 
 
 def losses(count: int = 400) -> dict[str, np.ndarray]:
-    """What is left of the margin with cones, of grasps with three and four contacts: by n_e, hard and soft."""
+    """The margin of (13) over that of (12), by n_e, for hard and soft contacts; grasps with three and four contacts."""
     found = {}
     for edges in (8, 16):
         for name in ("hard", "soft"):
@@ -86,7 +86,7 @@ def pair_scene(rng: np.random.Generator, loaded: bool) -> tuple[mujoco.MjModel, 
 
 
 def is_held(model: mujoco.MjModel, force: float, moment: float) -> bool:
-    """Whether the box stays under the moment about the line between the contacts, N m, which rises for 0.2 s."""
+    """Test whether the box stays under a moment about the line between the contacts, N m, which rises for 0.2 s."""
     data = mujoco.MjData(model)
     body = model.body("object").id
     data.ctrl[:] = force
@@ -100,7 +100,7 @@ def is_held(model: mujoco.MjModel, force: float, moment: float) -> bool:
 
 
 def thresholds(count: int = PAIRS) -> dict[str, np.ndarray]:
-    """Of every pair: the moment that (12) and (21) allow, N m, and whether MuJoCo holds a little less and more."""
+    """For every pair, the moments that (12) and (21) allow, N m, and whether MuJoCo holds 95 % and 105 % of (12)'s."""
     rng = np.random.default_rng(2)
     moments = jg.DisturbanceSet.vertices(np.array([[0, 0, 0, 1.0, 0, 0], [0, 0, 0, -1.0, 0, 0]]))
     rows: dict[str, list] = {"12": [], "21": [], "below": [], "above": [], "loaded": []}
@@ -150,7 +150,7 @@ def hardened(found: Candidates) -> Candidates:
 
 
 def published(hand: str, folders: list[Path]) -> list[str]:
-    """How well margins with and without torsion tell which grasps held, paired."""
+    """Compare, paired, how well margins with and without torsion tell which grasps held."""
     published_grasps.TRIAL |= {"condim": 4, "torsional_friction": GAMMA}
     found = [published_grasps.candidates(hand, folder) for folder in folders]
     soft = concatenate([candidates for candidates, _ in found])

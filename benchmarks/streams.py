@@ -133,7 +133,7 @@ def _report(found: dict[str, list[dict[str, float]]], candidates: int, memory: i
 
 
 def _costs(run: Path, inputs: Path, candidates: int) -> str:
-    """What a plan for more of them needs: bytes on disks and in networks, and how long it takes to merge summaries."""
+    """Measure what a plan for more needs: bytes on disks and in networks, and the time to merge summaries."""
     from pyarrow import ipc
 
     from jaxgrasp.ranking.streams.scored import Summary

@@ -24,7 +24,7 @@ COMMAND = [sys.executable, "-m", "jaxgrasp.cli", "rank", "--figure", "None", "--
 
 
 def killed(home: Path, kills: int, rows: int, seed: int) -> dict[str, int]:
-    """How many kills found the process at work, how many runs it took, and in how many states they left its folder."""
+    """Kill runs at random moments; count kills that found one at work, runs, and states of the folder."""
     for number in range(FILES):
         grasps = sample_grasps(rows // FILES, seed=number)
         fields = {name: getattr(grasps, name) for name in ("positions", "outward_normals", "friction", "max_force")}

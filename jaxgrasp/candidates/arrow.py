@@ -175,7 +175,7 @@ def _dense(array: pa.Array, name: Path | str, field: str, tail: tuple[int, ...])
 
 
 def _lengths(array: pa.Array) -> np.ndarray:
-    """How long each list is; 0 where it is null."""
+    """The lengths of lists, 0 where one is null."""
     lengths = pc.call_function("list_value_length", [array])
     return lengths.fill_null(0).to_numpy(zero_copy_only=False).astype(np.int64)
 

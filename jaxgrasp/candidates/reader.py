@@ -167,7 +167,7 @@ def check_contacts(path: Path | str, contacts: int) -> None:
 
 
 def wanted_for(name: str) -> str:
-    """What is wanted where a field is missing."""
+    """The words for an error about a missing field."""
     if name == "mass":
         return "the column, because gravity needs it"
     option = "--" + name.replace("_", "-")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 R = TypeVar("R", bound=RankOptions)
 
 MOST_IN_A_TABLE = 2_000_000
-"""Of more candidates the result is a folder."""
+"""The most candidates in one table; of more the result is a folder."""
 # Options that a run has from its beginning on.
 _OPTIONS = ("friction", "max_force", "gravity", "disturbances", "cone_edges", "share", "top", "prune", "metric")
 # The part that is read, that which is solved and that which is written are in memory at once, and copies of each.
@@ -154,7 +154,7 @@ def as_begun(command: R) -> R:
 
 
 def _options(command: RankOptions) -> dict[str, Any]:
-    """What a run is asked, as its manifest has it."""
+    """The options of a run, as its manifest has them."""
     from jaxgrasp.ranking.streams.sources import absolute, digest_of
 
     options: dict[str, Any] = {name: getattr(command, name) for name in _OPTIONS}
@@ -206,7 +206,7 @@ def rank_in_parts(command: RankOptions, folder: Path, given: GivenFiles, unit: s
 
 
 def _job(command: RankOptions, folder: Path, given: GivenFiles) -> "Job":
-    """What is to be done: a new run, or one that goes on.
+    """The job to do: that of a new run, or of one that goes on.
 
     Raises:
         CommandError: The run began with other options or files.

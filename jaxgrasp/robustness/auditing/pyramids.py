@@ -259,6 +259,6 @@ def _claims_flat(solution: Solution) -> jax.Array:
 
 
 def _outside(problem: Problem, solution: Solution, place: Range | None) -> jax.Array:
-    """Where b lies outside the range of G, or of what G has left where contacts have no friction, (lanes,)."""
+    """Where b lies outside the range of G, or of what G has left where contacts have hardly any friction, (lanes,)."""
     slippery = any_last((problem.friction < 1e-6) & problem.present)
     return slippery | (solution.rank < 6 if place is None else place.wrench_outside & place.rank_stands)

@@ -19,11 +19,12 @@ from jax import lax
 
 from jaxgrasp.arrays import fold
 from jaxgrasp.contact.compliance import pseudo_inverse
+from jaxgrasp.contact.contacts import LEAST_FRICTION
 from jaxgrasp.contact.friction import contact_facets
 from jaxgrasp.contact.row_space import RANK_TOLERANCE, whitened
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.robustness.grasps import Grasps
-from jaxgrasp.robustness.tightening.program import LEAST_FRICTION, force_units
+from jaxgrasp.robustness.tightening.program import force_units
 from jaxgrasp.solvers.conic.margin import ConeRows, ConicMargin
 
 
