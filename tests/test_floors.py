@@ -12,6 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "jaxgrasp"
 FLOORS = {
     "process": -2,
     "compiling": -1,
+    "cluster": -1,
     "arrays": 0,
     "linalg": 0,
     "storage": 0,

@@ -1,9 +1,11 @@
 """`jaxgrasp evaluate`: grasps tried by a named protocol, a table, a figure and movies out."""
 
+import contextlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,7 @@ import tyro
 
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.checks import Skipped, check_options, check_output, conclude, write_files
+from jaxgrasp.cli.clusters import check_ray, cluster_of
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names, scores_of
 from jaxgrasp.cli.published import Published, one_line_error
@@ -57,7 +60,11 @@ class Evaluate(Published):
     """Seed of the bootstrap for the intervals of areas under ROC curves; the trials have nothing random."""
 
     workers: int | None = None
-    """Number of threads; one for each core without it."""
+    """Number of threads; one for each core without it. With --ray, of processes: one for each processor without it."""
+
+    ray: str | None = None
+    """Try on a cluster of Ray whose nodes all see hand and objects, by its ADDRESS, or "local" for one of this
+    machine's own. Needs the extra ray."""
 
     movies: int = 0
     """Number of movies, written beside the table, of the first grasps that failed."""
@@ -117,6 +124,7 @@ class Evaluate(Published):
             ("--workers", self.workers, self.workers is None or 1 <= self.workers <= 1024, "1 to 1024"),
             ("--movies", self.movies, self.movies >= 0, "at least 0"),
         )
+        check_ray(self.ray)
         if self.movies and self.output is None:
             raise CommandError("--movies: got no --output; wanted a table that they are named after")
         for option, path, endings in (
@@ -136,16 +144,14 @@ class Evaluate(Published):
 
     def _tried(self, grasps: "GraspSet", skipped: Skipped) -> "Evaluation":
         from jaxgrasp.cli.report import stoppable_bar
-        from jaxgrasp.evaluation import evaluate
 
-        with one_line_error(self), stoppable_bar("trying grasps", len(grasps)) as progress:
-            found = evaluate(
+        with one_line_error(self), stoppable_bar("trying grasps", len(grasps)) as progress, self._where() as where:
+            found = where(
                 grasps,
                 hand=self.hand,
                 object=self.object,
                 protocol=self.protocol,
                 servo_gain=self.servo_gain,
-                workers=self.workers,
                 progress=progress,
                 skipped=skipped if self.keep_going else None,
             )
@@ -159,6 +165,26 @@ class Evaluate(Published):
                 f"{' and others' if len(diverged) > _TOLD else ''}"
             )
         return found
+
+    @contextlib.contextmanager
+    def _where(self) -> "Iterator[Callable[..., Evaluation]]":
+        """What tries grasps: this process, or a cluster.
+
+        Raises:
+            CommandError: There is no such cluster, or it cannot do the work.
+        """
+        from jaxgrasp.evaluation import evaluate
+
+        if self.ray is None:
+            yield partial(evaluate, workers=self.workers)
+            return
+        from jaxgrasp.evaluation.on_ray import evaluate_on_ray
+
+        try:
+            with cluster_of(self.ray, self.workers) as cluster:
+                yield partial(evaluate_on_ray, cluster)
+        except RuntimeError as error:
+            raise CommandError(f"--ray {self.ray}: {' '.join(str(error).split())}", 1) from error
 
     def _scores(self, found: "Evaluation", names: Sequence[str]) -> dict[str, np.ndarray]:
         from jaxgrasp.cli.report import counting_bar

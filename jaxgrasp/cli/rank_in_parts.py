@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from jaxgrasp.cli import signals
 from jaxgrasp.cli.checks import Skipped, conclude, write_files
+from jaxgrasp.cli.clusters import cluster_of
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.metrics import metric_names
 from jaxgrasp.cli.rank_options import FIGURE, OUTPUT, InParts, RankOptions
@@ -284,15 +285,11 @@ def _on_ray(command: RankOptions, job: "Job", given: GivenFiles, progress: Calla
     Raises:
         CommandError: There is no such cluster.
     """
-    from jaxgrasp.ranking.streams.on_ray import cluster, on_all_nodes, run_on_ray
+    from jaxgrasp.ranking.streams.on_ray import on_all_nodes, run_on_ray
 
-    address = command.in_parts.ray
-    assert address is not None
-    try:
-        with cluster(address, command.in_parts.ray_workers) as workers:
-            return run_on_ray(on_all_nodes(job), workers, budget=allowance(), skipped=given.skipped, progress=progress)
-    except (ConnectionError, ImportError) as error:
-        raise CommandError(f"--ray {address}: got no cluster ({' '.join(str(error).split())})") from error
+    assert command.in_parts.ray is not None
+    with cluster_of(command.in_parts.ray, command.in_parts.ray_workers) as cluster:
+        return run_on_ray(on_all_nodes(job), cluster, budget=allowance(), skipped=given.skipped, progress=progress)
 
 
 class _Conventions:

@@ -1,6 +1,5 @@
 """The options of `jaxgrasp rank`."""
 
-import importlib.util
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from jaxgrasp.cli.checks import check_options
+from jaxgrasp.cli.clusters import check_ray
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import Reading
@@ -54,8 +54,7 @@ class InParts:
         check_options(("--part-size", self.part_size, self.part_size >= 1, "at least 1"))
         if self.ray_workers is not None:
             check_options(("--ray-workers", self.ray_workers, self.ray_workers >= 1, "at least 1"))
-        if self.ray is not None and importlib.util.find_spec("ray") is None:
-            raise CommandError("--ray: Ray is not installed; wanted pip install 'jaxgrasp[ray]'")
+        check_ray(self.ray)
         if self.folder is None:
             if self.ray is not None or self.sorted:
                 option = "--ray" if self.ray is not None else "--sorted"

@@ -24,8 +24,13 @@ class FileError(ValueError):
             got: What came.
             wanted: What is wanted.
         """
+        self._given = file, field, got, wanted
         place = f"{file}: {field}" if field else str(file)
         super().__init__(printable(" ".join(f"{place}: got {got}; wanted {wanted}".split())))
+
+    def __reduce__(self) -> tuple[type["FileError"], tuple[Path | str, str | None, str, str]]:
+        """Takes it apart, so that it can go from one process to another."""
+        return FileError, self._given
 
 
 def printable(text: object) -> str:

@@ -2,6 +2,7 @@
 
 import io
 import os
+import pickle
 import struct
 import subprocess
 import sys
@@ -275,3 +276,8 @@ def test_the_cache_is_where_nobody_else_writes(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no home"):
         cache_folder("kernels")
     assert not Path("relative").exists()
+
+
+def test_an_error_goes_from_one_process_to_another():
+    error = FileError("a.npz", "positions", "text", "numbers")
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
+from ball_grasps import ball_grasps
 
 from jaxgrasp.cli import main
 from jaxgrasp.evaluation import diversity, evaluate, evaluation_table, film, summaries, wilson, write_evaluation
@@ -19,36 +20,6 @@ from jaxgrasp.hands.servos import ARMATURE, DAMPING, FRICTION, with_servos
 from jaxgrasp.simulation import PROTOCOLS, trial_scene
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-# rad: base, flex1 and flex2 of fingers whose tips touch a ball of 5 cm, and how much farther they squeeze.
-BENT, SQUEEZE = (0.0, -0.165, 1.124), (0.0, 0.35, 0.0)
-
-
-def ball_grasps(**columns) -> GraspSet:
-    """Squeezed; not squeezed; with the ball inside a finger; no configuration; squeezed once more."""
-    pose = np.tile([*_ball(), 1.0, 0.0, 0.0, 0.0], (5, 1))
-    pose[2, 0] += 0.02
-    joints, base = np.tile(np.tile(BENT, 4), (5, 1)), np.tile([0.0, 0, 0, 1, 0, 0, 0], (5, 1))
-    squeezed = joints + np.tile(SQUEEZE, 4)
-    squeezed[1] = joints[1]
-    base[3, 0] = np.nan
-    open_hand = joints - np.tile((0.0, 0.1, 0.0), 4)
-    stages = {"pregrasp": open_hand, "grasp": joints, "squeeze": squeezed}
-    return GraspSet(
-        stages={name: HandPoses(base, each) for name, each in stages.items()},
-        joint_names=None,
-        object_pose=pose,
-        object_scale=np.full(5, 0.05),
-        object_name=np.full(5, "ball"),
-        source=np.array([f"ball.npz:{k}" for k in range(5)]),
-        columns=columns,
-    )
-
-
-def _ball() -> np.ndarray:
-    from jaxgrasp.hands.scenes import four_fingers
-
-    model = four_fingers("sphere").compile()
-    return model.qpos0[model.jnt_qposadr[model.body("object").jntadr[0]] :][:3]
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,11 @@ Every node must see the inputs and the run's folder by the same paths. Workers w
 of their own, so that a part that is done twice is there once; what goes over the network is a summary a part.
 """
 
-import contextlib
 import importlib
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ import pyarrow as pa
 from jax.typing import ArrayLike
 from pyarrow import ipc
 
+from jaxgrasp.cluster import Cluster, JaxSettings, joined
 from jaxgrasp.ranking.streams.run import Job, Read, Skipped
 from jaxgrasp.ranking.streams.scored import Summary
 from jaxgrasp.ranking.streams.tables import TableRanker
@@ -29,64 +29,9 @@ Dataset = Any
 _MERGED, _LEFT = 32, 256
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Jax:
-    """How JAX is set in the driver, and shall be in workers."""
-
-    x64: bool
-    cache: str | None
-
-    @classmethod
-    def own(cls) -> "_Jax":
-        import jax
-
-        # JAX gives its configuration the options while it is imported: no stub has them.
-        cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-        return cls(x64=jax.config.jax_enable_x64, cache=cache)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def set(self) -> None:
-        import jax
-
-        jax.config.update("jax_enable_x64", self.x64)
-        if self.cache is not None:
-            jax.config.update("jax_compilation_cache_dir", self.cache)
-
-
-@contextlib.contextmanager
-def cluster(address: str, workers: int | None = None) -> Iterator[dict[str, Any]]:
-    """Joins a cluster, or starts one on this machine, and leaves it again; one that was joined before stays.
-
-    Args:
-        address: That of a cluster, or "local" for one of this machine's own.
-        workers: How many processes; None is one a GPU, and without GPUs one a processor.
-
-    Yields:
-        What `map_batches` is to be told of workers.
-
-    Raises:
-        ImportError: Ray is not installed.
-        ConnectionError: There is no such cluster.
-    """
-    ray = _ray()
-    mine = not ray.is_initialized()
-    if mine:
-        own = {"num_cpus": workers} if address == "local" else {"address": address}
-        ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR", **own)
-    try:
-        logging.getLogger("ray.data").setLevel(logging.ERROR)
-        there = ray.cluster_resources()
-        gpus = int(there.get("GPU", 0))
-        count = workers or gpus or int(there.get("CPU", 1))
-        pool = ray.data.ActorPoolStrategy(size=count)
-        yield {"compute": pool, **({"num_gpus": 1} if gpus else {"num_cpus": 1})}
-    finally:
-        if mine:
-            ray.shutdown()
-
-
 def run_on_ray(
     job: Job,
-    workers: dict[str, Any],
+    cluster: Cluster,
     *,
     budget: int,
     skipped: Skipped | None = None,
@@ -98,7 +43,7 @@ def run_on_ray(
 
     Args:
         job: The run; its folder is an absolute path that all nodes see.
-        workers: Of `cluster`.
+        cluster: Where to.
         budget: Bytes of memory that one file may ask for.
         skipped: Told of what could not be read.
         progress: Called with the number of candidates done.
@@ -110,19 +55,19 @@ def run_on_ray(
         ValueError: A file cannot be read, or a part cannot be written.
         RuntimeError: A part failed for another reason than that its worker was lost.
     """
-    ray = _ray()
+    data = _ray_data()
     report, tell = progress or (lambda _: None), skipped or (lambda _: None)
-    context = ray.data.DataContext.get_current()
+    context = data.DataContext.get_current()
     # Of equals the first one is to rank first: summaries are merged in the order of their parts.
     context.execution_options.preserve_order = True
     parts = len(job.plan)
-    rows = ray.data.from_items([{"part": number} for number in range(parts)], override_num_blocks=parts)
+    rows = data.from_items([{"part": number} for number in range(parts)], override_num_blocks=parts)
     rows = rows.map_batches(
         _Worker,
-        fn_constructor_args=(job, _Jax.own(), budget),
+        fn_constructor_args=(job, JaxSettings.own(), budget),
         batch_size=1,
         batch_format="pyarrow",
-        **workers,
+        **_workers(cluster),
     )
     while parts > _LEFT:
         rows = rows.map_batches(_merge, fn_args=(job.setting.top,), batch_size=_MERGED, batch_format="pyarrow")
@@ -137,7 +82,7 @@ def run_on_ray(
                 tell(ValueError(error))
             done += row["rows"]
             report(done)
-    except ray.exceptions.RayError as error:
+    except cluster.ray.exceptions.RayError as error:
         raise RuntimeError(str(error).strip().splitlines()[0]) from error
     return Summary.merged(found, job.setting.top)
 
@@ -145,7 +90,7 @@ def run_on_ray(
 class _Worker:
     """Does parts in a process that keeps what it has compiled."""
 
-    def __init__(self, job: Job, jax: _Jax, budget: int):
+    def __init__(self, job: Job, jax: JaxSettings, budget: int):
         jax.set()
         self._job, self._reader, self._budget = job, job.reader(), budget
 
@@ -230,20 +175,20 @@ def rank_dataset(
     """
     options = {"gravity": gravity, "cone_edges": cone_edges, "friction": friction, "max_force": max_force}
     ranker = TableRanker(None if disturbances is None else np.asarray(disturbances), metrics=metrics, **options)
-    with cluster("auto", workers) as resources:
+    with joined("auto", workers) as cluster:
         return dataset.map_batches(
             _Ranker,
-            fn_constructor_args=(ranker, _Jax.own()),
+            fn_constructor_args=(ranker, JaxSettings.own()),
             batch_size=batch,
             batch_format="pyarrow",
-            **resources,
+            **_workers(cluster),
         )
 
 
 class _Ranker:
     """A ranker in a process that is set like the driver."""
 
-    def __init__(self, ranker: TableRanker, jax: _Jax):
+    def __init__(self, ranker: TableRanker, jax: JaxSettings):
         jax.set()
         self._ranker = ranker
 
@@ -251,14 +196,15 @@ class _Ranker:
         return self._ranker(batch)
 
 
-def _ray() -> Any:
-    """Ray.
+def _ray_data() -> Any:
+    data = importlib.import_module("ray.data")
+    logging.getLogger("ray.data").setLevel(logging.ERROR)
+    return data
 
-    Raises:
-        ImportError: It is not installed.
-    """
-    importlib.import_module("ray.data")
-    return importlib.import_module("ray")
+
+def _workers(cluster: Cluster) -> dict[str, Any]:
+    """What `map_batches` is told of workers."""
+    return {"compute": _ray_data().ActorPoolStrategy(size=cluster.workers), **cluster.each}
 
 
 def on_all_nodes(job: Job) -> Job:
