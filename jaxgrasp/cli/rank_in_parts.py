@@ -103,7 +103,7 @@ class GivenFiles:
         from jaxgrasp.ranking.streams.plan import PartReader, parts_of, schema_of
         from jaxgrasp.ranking.streams.sources import is_url
 
-        if not self.keep_going and all(s.kind == "npz" and not is_url(s.path) for s in self.sources):
+        if not self.keep_going and all(s.kind == "npz" and not s.keys and not is_url(s.path) for s in self.sources):
             return read_candidates(self.files, **vars(self.setting.given))
         size = sum(source.rows * source.row_size for source in self.sources)
         if size > allowance():

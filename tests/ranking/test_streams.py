@@ -138,6 +138,20 @@ def test_folders_patterns_and_all_kinds_of_files(here, capsys):
     assert table["name"].to_pylist()[:TOP] == best["name"].to_pylist()
 
 
+def test_folders_that_stand_for_columns(here, capsys):
+    for place in ("hand=shadow/object=a%20can", "hand=allegro"):
+        (here / "in" / place).mkdir(parents=True)
+        write(here / "in" / place / "a.npz", seed=len(place))
+    write(here / "in" / "hand=allegro" / "b.parquet")
+    assert ran("in", "--run", "found", "--top", TOP) == 0
+    rows = rows_of("found")
+    assert rows["hand"].to_pylist() == 80 * ["allegro"] + 40 * ["shadow"]
+    assert rows["object"].to_pylist() == 80 * [None] + 40 * ["a can"]
+    assert ran("in", "--output", "all.csv", "--figure", "None") == 0
+    assert ran("in/hand=shadow", "--output", "one.parquet", "--figure", "None") == 0
+    assert set(pyarrow.parquet.read_table("one.parquet")["hand"].to_pylist()) == {"shadow"}
+
+
 def test_urls(here, capsys):
     fsspec = pytest.importorskip("fsspec")
     with fsspec.open("memory://grasps/a.npz", "wb") as stream:

@@ -2,10 +2,11 @@
 
 import contextlib
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Protocol, cast
+from urllib.parse import unquote
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +14,7 @@ from pyarrow import ipc, parquet
 
 from jaxgrasp.candidates import Candidates
 from jaxgrasp.candidates.arrow import candidates_of_table
-from jaxgrasp.candidates.reader import candidates_of_arrays, fields_of
+from jaxgrasp.candidates.reader import FIELDS, candidates_of_arrays, fields_of
 from jaxgrasp.ranking.table import arrow_column
 from jaxgrasp.storage import Archive, ArchiveRows, FileError, allowance, archive_in, open_regular, printable, reason_of
 
@@ -63,6 +64,8 @@ class Source:
     """Columns that travel along."""
     row_size: int
     """Bytes that a candidate takes in memory."""
+    keys: tuple[tuple[str, str], ...] = ()
+    """Columns of one value, text, that folders called NAME=VALUE above the file stand for, as datasets of Hive have."""
 
 
 class Rows(Protocol):
@@ -154,6 +157,8 @@ def source_of(name: str, given: Given) -> Source:
             names, travelling = schema.names, travelling.schema
             if not rows:
                 raise FileError(name, "positions", "no candidates", "at least one")
+    keys = _keys(name, {*names, *FIELDS})
+    travelling = pa.schema([*travelling, *((key, pa.string()) for key, _ in keys)])
     contact = 8 * (3 + (9 if sample.frames is not None else 3) + 3)
     # Lists of variable size tell of no number of contacts before they are read.
     contacts = sample.num_contacts if sample.num_contacts > 1 else 4
@@ -168,6 +173,7 @@ def source_of(name: str, given: Given) -> Source:
         massive="mass" in names,
         travelling=travelling,
         row_size=contacts * contact + sum(_width(field.type) for field in travelling),
+        keys=keys,
     )
 
 
@@ -283,6 +289,13 @@ def _batches(stream: BinaryIO, kind: str, start: int) -> tuple[Iterator[pa.Recor
         first += 1
     groups = list(range(first, file.num_row_groups))
     return file.iter_batches(_ROWS_AT_ONCE, row_groups=groups, use_threads=False), start
+
+
+def _keys(name: str, there: Collection[str]) -> tuple[tuple[str, str], ...]:
+    """What the folders above a file say of its rows, but for what the file has itself."""
+    pairs = (piece.partition("=") for piece in name.split("/")[:-1])
+    found = {key: unquote(value) for key, sign, value in pairs if key and sign}
+    return tuple((key, value) for key, value in found.items() if key not in there)
 
 
 def _digest(stream: BinaryIO, size: int) -> str:
