@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from jaxgrasp import metrics, solvers
 from jaxgrasp.contact import Actuation, Compliance, Contacts, grasp_map, required_wrench
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.explanation import Explanation, explain
 from jaxgrasp.kernels import without as without_kernels
 from jaxgrasp.robustness import (
     Comparison,
@@ -39,6 +40,7 @@ __all__ = [
     "Compliance",
     "Contacts",
     "DisturbanceSet",
+    "Explanation",
     "FormulationSolution",
     "Solution",
     "SpecifiedDisturbances",
@@ -48,6 +50,7 @@ __all__ = [
     "blocking_forces",
     "compare_formulations",
     "evaluate",
+    "explain",
     "formulation_margin",
     "grasp_map",
     "largest_disturbance",

@@ -28,6 +28,7 @@ FLOORS = {
     "hands": 5,
     "candidates": 5,
     "files": 6,
+    "explanation": 6,
     "simulation": 6,
     "synthesis": 7,
     "ranking": 7,

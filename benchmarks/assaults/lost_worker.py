@@ -38,11 +38,15 @@ def lost(home: Path, rows: int, workers: int, parts: int) -> dict[str, float]:
     there = lambda: len(list((home / "cluster" / "parts").glob("*.parquet")))
     while there() < parts // 3 and process.poll() is None:
         time.sleep(0.01)
-    at, killed = there(), _workers(process.pid)
-    os.kill(killed[0], signal.SIGKILL)
+    # Between two parts a worker may be called otherwise.
+    while not (killed := _workers(process.pid)) and process.poll() is None:
+        time.sleep(0.01)
+    at = there()
+    if killed:
+        os.kill(killed[0], signal.SIGKILL)
     told, _ = process.communicate(timeout=1_800)
-    if process.returncode:
-        raise RuntimeError(told)
+    if process.returncode or not killed:
+        raise RuntimeError(told or "the cluster was done before a worker could be killed")
     took = time.monotonic() - begin
     _compare(home / "cluster", home / "plain", rows)
     return {"without": plain, "with": took, "workers": len(killed), "parts there": at}

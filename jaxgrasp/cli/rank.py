@@ -90,6 +90,7 @@ class Rank(RankOptions):
             ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
             ("--share", self.share, 0.0 < self.share <= 1.0, "a number in (0, 1]"),
             ("--top", self.top, self.top >= 0, "a number >= 0"),
+            ("--explain", self.explain, self.explain >= 0, "a number >= 0"),
         )
         if self.prune and self.metric:
             raise CommandError("--prune: got --metric, too; wanted a ranking by the margin alone")
@@ -160,12 +161,15 @@ class Rank(RankOptions):
         clock.lap()
         written, unwritten = self._write(ranking, unit, hands)
         zeros = self._why_zero(ranking, disturbances)
+        explained = self._explained(ranking, disturbances)
         with printing():
             print_ranking(ranking, Sketch.of(ranking.margin, ranking.status), unit, clock, zeros, written)
+            for line in explained:
+                print(line)
         conclude(complaint, unwritten, code)
 
     def _why_zero(self, ranking: "Ranking", disturbances: "DisturbanceSet") -> list[str]:
-        from jaxgrasp.ranking import is_zero, why_zero
+        from jaxgrasp.explanation import is_zero, why_zero
         from jaxgrasp.ranking.tiles import columns_of, contacts_of
 
         return why_zero(
@@ -174,6 +178,21 @@ class Rank(RankOptions):
             disturbances,
             cone_edges=self.cone_edges,
         )
+
+    def _explained(self, ranking: "Ranking", disturbances: "DisturbanceSet") -> list[str]:
+        from jaxgrasp.explanation import explain
+        from jaxgrasp.ranking.tiles import columns_of, contacts_of, task_of
+
+        best = ranking.order[: self.explain]
+        if not len(best):
+            return []
+        candidates = ranking.candidates.take(best)
+        columns = columns_of(candidates)
+        found = explain(contacts_of(columns), disturbances, **task_of(columns, self.gravity, self.cone_edges))
+        names = [
+            f"{Path(candidates.sources[s]).name}:{i}" for s, i in zip(candidates.source, candidates.index, strict=True)
+        ]
+        return [f"{name}: {'. '.join(found.words(row))}" for row, name in enumerate(names)]
 
     def _write(self, ranking: "Ranking", unit: str, hands: "list[HandObject]") -> tuple[list[Path], list[str]]:
         from jaxgrasp.ranking import write_table

@@ -63,6 +63,8 @@ class InParts:
         option = "--run" if self.run else "--resume"
         if self.run and self.resume:
             raise CommandError("--run: got --resume, too; wanted one of them")
+        if command.explain:
+            raise CommandError(f"--explain: got {option}, too; wanted a ranking in one table")
         if command.of_hand.given or not command.files:
             raise CommandError(f"{option}: got no files of candidates; wanted some, and no hand")
         if command.output not in (OUTPUT, None):
@@ -103,6 +105,10 @@ class RankOptions(Reading):
 
     top: int = 10
     """How many of the best get tightening forces."""
+
+    explain: int = 0
+    """Of how many of the best to tell what ends their margin, which disturbance they stand least, and what would
+    help."""
 
     prune: bool = False
     """Give up grasps that cannot be among the best --top as soon as their bounds tell: the best are the same, sooner;

@@ -210,7 +210,7 @@ def print_synthesis(
         name: The object's name.
         note: What else is to be said of the object; empty for nothing.
         unit: Unit of the margin.
-        why_zero: Why margins are zero, of `ranking.why_zero`.
+        why_zero: Why margins are zero, of `explanation.why_zero`.
         written: The files that were written.
     """
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
@@ -242,7 +242,7 @@ def print_ranking(
         sketch: Of all candidates.
         unit: Unit of the margin.
         clock: How long it took.
-        why_zero: Why margins are zero, of `ranking.why_zero`.
+        why_zero: Why margins are zero, of `explanation.why_zero`.
         written: The files that were written.
     """
     # Without a terminal rich would assume 80 columns and cut names short.

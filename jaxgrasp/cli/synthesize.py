@@ -207,7 +207,7 @@ class Synthesize(Reading):
 
     def _why_zero(self, found: "Synthesis", disturbances: Any) -> list[str]:
         from jaxgrasp.contact import Contacts
-        from jaxgrasp.ranking import is_zero, why_zero
+        from jaxgrasp.explanation import is_zero, why_zero
 
         given = {"friction": self.friction or _FRICTION, "max_force": self.max_force}
         return why_zero(

@@ -75,6 +75,20 @@ def load_of(columns: Any, gravity: Any) -> Any:
     return required_wrench(columns["mass"], gravity=jnp.array([0.0, 0.0, -1.0]) * gravity)
 
 
+def task_of(columns: Any, gravity: Any, cone_edges: int) -> dict[str, Any]:
+    """The arguments of (21) and (22) beside contacts and disturbances.
+
+    Args:
+        columns: As for `load_of`.
+        gravity: Likewise.
+        cone_edges: Edges of the friction pyramid.
+    """
+    actuation = None
+    if "jacobian" in columns:
+        actuation = Actuation(**{f.name: columns.get(f.name) for f in dataclasses.fields(Actuation)})
+    return {"required_wrench": load_of(columns, gravity), "cone_edges": cone_edges, "actuation": actuation}
+
+
 def solve_in_tiles(
     solver: Callable[..., Any],
     columns: Columns,
@@ -148,13 +162,8 @@ def _solve_tile(
     columns: Any, disturbances: DisturbanceSet, gravity: Any, solver: Any, cone_edges: int, loaded: bool, mesh: Mesh
 ) -> Any:
     def on_one_device(columns: Any, disturbances: DisturbanceSet, gravity: Any) -> Any:
-        contacts = contacts_of(columns)
-        load = load_of(columns, gravity if loaded else None)
-        actuation = None
-        if "jacobian" in columns:
-            actuation = Actuation(**{f.name: columns.get(f.name) for f in dataclasses.fields(Actuation)})
-        task = {"required_wrench": load, "cone_edges": cone_edges, "actuation": actuation}
-        return solver(contacts, disturbances, task, columns)
+        task = task_of(columns, gravity if loaded else None, cone_edges)
+        return solver(contacts_of(columns), disturbances, task, columns)
 
     spread = jax.shard_map(on_one_device, mesh=mesh, in_specs=(P("candidates"), P(), P()), out_specs=P("candidates"))
     return spread(columns, disturbances, gravity)

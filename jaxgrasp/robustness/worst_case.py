@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import fold, literal, safe_divide
+from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, pseudo_inverse, pseudo_inverse_adjoint
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import contact_facets, pyramid_facets
@@ -34,6 +35,7 @@ def worst_case(
     disturbances: DisturbanceSet,
     compliance: Array | Compliance | None = None,
     cone_edges: int = 8,
+    actuation: Actuation | None = None,
 ) -> tuple[Float[Array, "*batch contacts edges"], Float[Array, "*batch contacts"]]:
     """S_1 (17) and S_2 (18): what the worst unit disturbance takes from every row of C f <= -d and -E f <= f_max.
 
@@ -45,6 +47,7 @@ def worst_case(
         disturbances: the set D, object frame.
         compliance: Q, see `largest_disturbance`.
         cone_edges: n_e.
+        actuation: what the hand can do: G* leaves joint directions that no actuator reaches without torque.
 
     Returns:
         S_1 <= 0 (*batch, n_c, n_e), 2 n_e of soft contacts, N, and S_2 >= 0 (*batch, n_c), N; zero for absent contacts,
@@ -54,7 +57,7 @@ def worst_case(
         ValueError: shapes or options that do not fit.
     """
     pyramid_facets(cone_edges)
-    data = GraspData.from_arguments(contacts, disturbances, compliance=compliance)
+    data = GraspData.from_arguments(contacts, disturbances, compliance=compliance, actuation=actuation)
     return over_grasps(_WorstCase(cone_edges), data)
 
 

@@ -17,7 +17,7 @@ from jax_sample import PUSHES, grasps, margin
 
 import jaxgrasp as jg
 from jaxgrasp import linalg
-from jaxgrasp.ranking.zero_margins import _reasons
+from jaxgrasp.explanation.zero_margins import reasons
 
 SIZES = [1, 2, 3, 6, 7, 16, 23, 40]
 SHAPES = [(1, 1), (4, 1), (2, 2), (3, 6), (16, 6), (5, 7), (22, 22), (40, 13)]
@@ -148,7 +148,7 @@ PROGRAMS = {
     "ferrari_canny_bound": slope(jg.metrics.ferrari_canny_bound),
     "ferrari_canny_bound, Linf": lambda c: jg.metrics.ferrari_canny_bound(c, "Linf"),
     "solve_qp": quadratic,
-    "why margins are zero": lambda c: _reasons(c, PUSHES, 4),
+    "why margins are zero": lambda c: reasons(c, PUSHES, 4),
 }
 
 

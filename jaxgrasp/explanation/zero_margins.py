@@ -22,7 +22,7 @@ from jaxgrasp.solvers.status import Status
 # Of more grasps than this the reasons of so many are found, evenly spread over them.
 _LOOKED_AT = 1_000
 
-_REASONS = {
+REASONS = {
     "contact": "without contacts",
     "line": "with contacts on one line (as two always are), about which hard contacts do not resist a turn",
     "friction": "without friction",
@@ -30,6 +30,7 @@ _REASONS = {
     "closure": "without force closure: no forces inside the friction cones squeeze the object",
     "spare": "with force closure, to which the load, the largest forces or the actuators leave no force to spare",
 }
+"""Why a margin is zero, in words that follow "a grasp"; the first one that is true."""
 # Multiples of the disturbances below which a margin is none.
 _SMALLEST_MARGIN = 1e-6
 
@@ -70,20 +71,29 @@ def why_zero(
     looked_at = rows[:: -(-len(rows) // _LOOKED_AT)]
     # Of few sizes, so that there are few programs.
     more = np.full(power_of_two(len(looked_at), 1) - len(looked_at), looked_at[-1])
-    found = np.asarray(_reasons(contacts_of(np.concatenate([looked_at, more])), disturbances, cone_edges))
+    found = np.asarray(reasons(contacts_of(np.concatenate([looked_at, more])), disturbances, cone_edges))
     found = found[: len(looked_at)]
     of = "" if len(looked_at) == len(rows) else f" of {len(looked_at):,} looked at"
-    counts = {reason: int((found == number).sum()) for number, reason in enumerate(_REASONS)}
+    counts = {reason: int((found == number).sum()) for number, reason in enumerate(REASONS)}
     return [
-        f"{count:,}{of} {_REASONS[reason]}"
+        f"{count:,}{of} {REASONS[reason]}"
         for reason, count in sorted(counts.items(), key=lambda item: -item[1])
         if count
     ]
 
 
 @functools.partial(compiled, static_argnums=(2,), pace=lambda *_: "soon")
-def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) -> jax.Array:
-    """The place of each grasp's reason in `_REASONS`."""
+def reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) -> jax.Array:
+    """Why the margins of grasps are zero, where they are.
+
+    Args:
+        contacts: Grasps with one batch axis.
+        disturbances: The set that the margins scale; with one batch axis or none.
+        cone_edges: Edges of the friction pyramid.
+
+    Returns:
+        The place of each grasp's reason in `REASONS`.
+    """
     edges = edges_of(contacts, WrenchSpace(cone_edges=cone_edges))
     smooth = edges.present & (jnp.where(edges.present, contacts.friction, 1) == 0)
     others = [jnp.zeros_like(smooth)] * (edges.grasp_map.shape[-1] - 2)
@@ -112,4 +122,4 @@ def _reasons(contacts: Contacts, disturbances: DisturbanceSet, cone_edges: int) 
         "closure": ~closed,
         "spare": jnp.ones_like(closed),
     }
-    return jnp.argmax(jnp.stack([conditions[reason] for reason in _REASONS]), axis=0)
+    return jnp.argmax(jnp.stack([conditions[reason] for reason in REASONS]), axis=0)

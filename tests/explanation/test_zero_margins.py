@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import jaxgrasp as jg
+import jaxgrasp.explanation
 import jaxgrasp.ranking
 from jaxgrasp.candidates import sample_grasps
 from jaxgrasp.cli import main
 from jaxgrasp.cli.report import Clock
-from jaxgrasp.ranking import why_zero
+from jaxgrasp.explanation import why_zero
 from jaxgrasp.solvers.status import Status
 
 FORCES, BOX = jg.DisturbanceSet.forces(1.0), jg.DisturbanceSet.box(np.array([1, 1, 1, 0.02, 0.02, 0.02]))
@@ -73,7 +74,7 @@ def test_margins_are_zero_for_the_reasons_told():
     names = ["two", "one", "above", "smooth", "around", "slippery", "one of four slippery"]
     contacts = stacked(names)
     found = jg.largest_disturbance(contacts, BOX)
-    zero = jaxgrasp.ranking.is_zero(np.asarray(found.margin), np.asarray(found.status))
+    zero = jaxgrasp.explanation.is_zero(np.asarray(found.margin), np.asarray(found.status))
     np.testing.assert_array_equal(zero, [True, True, True, True, False, True, False])
     lines = why_zero(some(contacts), zero, BOX)
     assert [line.split()[0] for line in lines] == ["2", "1", "1", "1"] and "on one line" in lines[0]
