@@ -6,7 +6,7 @@ Its forces may break rows that it does not have; mixed with forces deep inside a
 lambda from below, and the members that break the worst rows are added.
 
 The rows are those of a pyramid with so many edges that what it takes from Coulomb's cone, a millionth of the friction,
-does not show.
+does not show. In one grasp of a hundred the forces have so little room that it does: these get more edges.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -22,7 +22,8 @@ from jaxgrasp.solvers.status import Status
 
 # Grasps at a time: their rows are all looked at together.
 _LANES = 64
-_EDGES = 2048
+# For all grasps, then for those that are left.
+_EDGES = (2048, 8192)
 _MOST_ROUNDS = 20
 # Members that were added so many rounds ago make room for others.
 _ROUNDS_KEPT = 6
@@ -108,28 +109,31 @@ def _refine_some(
     members = np.zeros((len(lanes), programs.directions, 6))
     deep = programs.of(lanes, members).forces
     members[:, : first.shape[1]] = first[lanes]
-    rows = _rows_of(programs, lanes, blocks[lanes])
     added = np.arange(first.shape[1], programs.directions).reshape(_ROUNDS_KEPT, -1)
-    answer = programs.of(lanes, members)
-    bounds.status[lanes] = answer.status
-    found, live, best = answer, np.arange(len(lanes)), first_direction(answer, first[lanes, 0])
-    for turn in range(_MOST_ROUNDS):
-        # Bounds by the programs, and by their forces mixed with others.
-        before = bounds.lower[lanes[live]], bounds.upper[lanes[live]]
-        bounds.note(lanes[live], found, members[live])
-        own = rows.of(live)
-        share, broken = own.mixture(found.forces, deep[live], found.margin)
-        lower = np.where(found.status == Status.SOLVED, (1 - share) * found.margin, 0)
-        better = lower > before[0]
-        bounds.lower[lanes[live]] = np.maximum(lower, before[0])
-        mixed = _mix(found, deep[live], members[live], blocks[lanes[live]], share)
-        best = jax.tree.map(lambda old, new, at=live[better], rows=better: _put(old, at, new[rows]), best, mixed)
+    found, live = programs.of(lanes, members), np.arange(len(lanes))
+    bounds.status[lanes], best = found.status, first_direction(found, first[lanes, 0])
+    for edges in _EDGES:
+        rows = _rows_of(programs, lanes[live], blocks[lanes[live]], edges)
+        for turn in range(_MOST_ROUNDS):
+            # Bounds by the programs, and by their forces mixed with others.
+            before = bounds.lower[lanes[live]], bounds.upper[lanes[live]]
+            bounds.note(lanes[live], found, members[live])
+            share, broken = rows.mixture(found.forces, deep[live], found.margin)
+            lower = np.where(found.status == Status.SOLVED, (1 - share) * found.margin, 0)
+            better = lower > before[0]
+            bounds.lower[lanes[live]] = np.maximum(lower, before[0])
+            mixed = _mix(found, deep[live], members[live], blocks[lanes[live]], share)
+            best = jax.tree.map(lambda old, new, at=live[better], rows=better: _put(old, at, new[rows]), best, mixed)
 
-        # Add the members that break the worst row of each contact.
-        moved = better | (bounds.upper[lanes[live]] < before[1])
-        still = moved & ~bounds.closed(tolerance)[lanes[live]] & (found.status == Status.SOLVED)
-        members[live[:, None], added[turn % _ROUNDS_KEPT]] = broken
-        live = live[still]
+            # Add the members that break the worst row of each contact.
+            moved = better | (bounds.upper[lanes[live]] < before[1])
+            still = moved & ~bounds.closed(tolerance)[lanes[live]] & (found.status == Status.SOLVED)
+            members[live[:, None], added[turn % _ROUNDS_KEPT]] = broken
+            live, rows = live[still], rows.of(still)
+            if not len(live):
+                break
+            found = programs.of(lanes[live], members[live])
+        live = np.flatnonzero((bounds.status[lanes] == Status.SOLVED) & ~bounds.closed(tolerance)[lanes])
         if not len(live):
             break
         found = programs.of(lanes[live], members[live])
@@ -137,14 +141,14 @@ def _refine_some(
     return best
 
 
-def _rows_of(programs: Programs, lanes: np.ndarray, blocks: np.ndarray) -> _Rows:
+def _rows_of(programs: Programs, lanes: np.ndarray, blocks: np.ndarray, edges: int) -> _Rows:
     """The rows of some lanes, and how far their sets reach along them, for blocks of G* (L, n, 3, 6)."""
     contacts = programs.data.contacts
     friction, most = contacts.friction[lanes].astype(float), contacts.max_force[lanes].astype(float)
     # Without friction the rows say that a finger does not pull, see `admit`.
     friction[friction == 0] = 1
-    facets = pyramid_facets(_EDGES)
-    tangents = np.broadcast_to(facets[:, :2], (*friction.shape, _EDGES, 2))
+    facets = pyramid_facets(edges)
+    tangents = np.broadcast_to(facets[:, :2], (*friction.shape, edges, 2))
     normals = np.concatenate([tangents, (friction[..., None] * facets[:, 2])[..., None]], -1)
     bound = np.broadcast_to([0.0, 0.0, -1.0], (*friction.shape, 1, 3))
     normals = np.concatenate([normals, bound], 2)
@@ -157,7 +161,7 @@ def _rows_of(programs: Programs, lanes: np.ndarray, blocks: np.ndarray) -> _Rows
     # One value for all grasps, one a grasp, or one a contact.
     reserve = reserve.reshape(*reserve.shape, *[1] * (2 - reserve.ndim))
     reserve = np.where(contacts.active[lanes], reserve, 0)[..., None]
-    sides = np.concatenate([np.broadcast_to(-reserve, (*friction.shape, _EDGES)), most[..., None]], -1)
+    sides = np.concatenate([np.broadcast_to(-reserve, (*friction.shape, edges)), most[..., None]], -1)
     return _Rows(
         normals,
         reach.reshape(normals.shape[:-1]),
