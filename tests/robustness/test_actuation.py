@@ -43,20 +43,20 @@ class Hand:
         return {"required_wrench": WEIGHT, "compliance": self.compliance, "actuation": self.actuation}
 
 
-def make(seed: int, actuators: int, redundant: bool, compliant: bool) -> Hand:
-    rng = np.random.default_rng(seed)
+def make(count: int, actuators: int, redundant: bool, compliant: bool) -> Hand:
+    rng = np.random.default_rng(3)
     normals = np.array([[-1.0, 0.0, 0.1], [0.8, -0.6, 0.2], [0.8, 0.6, 0.2], [0.9, 0.0, -0.7]])
-    normals = normals + 0.25 * rng.normal(size=(BATCH, CONTACTS, 3))
+    normals = normals + 0.25 * rng.normal(size=(count, CONTACTS, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    friction = rng.uniform(0.4, 0.9, (BATCH, CONTACTS))
+    friction = rng.uniform(0.4, 0.9, (count, CONTACTS))
     transmission = np.eye(JOINTS)[:, :actuators] + 0.3 * rng.normal(size=(JOINTS, actuators))
     if redundant:
         transmission = np.column_stack([transmission, 0.7 * transmission[:, 0]])
-    limits = rng.uniform(0.1, 0.3, (BATCH, transmission.shape[1]))
-    M = rng.normal(size=(BATCH, 3 * CONTACTS, 3 * CONTACTS))
+    limits = rng.uniform(0.1, 0.3, (count, transmission.shape[1]))
+    M = rng.normal(size=(count, 3 * CONTACTS, 3 * CONTACTS))
     return Hand(
         contacts=jg.Contacts.from_normals(0.03 * normals, normals, friction=friction, max_force=6.0),
-        jacobian=0.05 * rng.normal(size=(BATCH, CONTACTS, 3, JOINTS)),
+        jacobian=0.05 * rng.normal(size=(count, CONTACTS, 3, JOINTS)),
         transmission=transmission,
         lower=-limits,
         upper=1.2 * limits,
@@ -99,11 +99,16 @@ def without_friction(hand: Hand) -> Hand:
     return replace(hand, contacts=replace(hand.contacts, friction=hand.contacts.friction.at[:, -1].set(0)))
 
 
-HANDS = {
-    "an actuator a joint": make(3, JOINTS, redundant=False, compliant=False),
-    "two joint directions unreached, one reached twice": make(3, JOINTS - 2, redundant=True, compliant=True),
-    "a contact without friction": without_friction(make(3, JOINTS - 2, redundant=True, compliant=True)),
-}
+def make_hands(count: int) -> dict[str, Hand]:
+    coupled = make(count, JOINTS - 2, redundant=True, compliant=True)
+    return {
+        "an actuator a joint": make(count, JOINTS, redundant=False, compliant=False),
+        "two joint directions unreached, one reached twice": coupled,
+        "a contact without friction": without_friction(coupled),
+    }
+
+
+HANDS = make_hands(BATCH)
 
 
 @pytest.fixture(scope="module", params=HANDS, ids=str)
@@ -145,15 +150,21 @@ def test_least_effort_is_that_of_clarabel():
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", HANDS)
 def test_least_joint_torques_are_clarabels(name):
-    hand = HANDS[name]
-    margin = 0.75 * np.array([largest_actuated(*rows_of(hand, lane)) for lane in range(BATCH)])
+    # Of grasps with a contact without friction one in fifteen withstands anything.
+    count = 10 * BATCH
+    hand = make_hands(count)[name]
+    margin = 0.75 * np.array([largest_actuated(*rows_of(hand, lane)) for lane in range(count)])
     solve = partial(jg.least_effort, hand.contacts, PUSHES, np.maximum(margin, 0), **hand.task)
     weights = np.asarray(hand.actuation.joint_torque_weights())
     found = solve(effort_weights=weights)
     holds = margin > 0
-    assert holds.sum() > BATCH / 6
+    assert holds.sum() > BATCH / 2
     assert np.all(np.asarray(found.status)[holds] == jg.Status.SOLVED)
-    truth = np.array([least(*rows_of(hand, lane), margin[lane], weights[lane]) for lane in np.flatnonzero(holds)])
+    # Without friction a contact transmits its normal force alone; the others, free in these rows, weigh for themselves.
+    felt = np.repeat(np.asarray(hand.contacts.friction) > 0, 3, 1)
+    felt[:, 2::3] = True
+    own = np.where(felt[:, :, None] & felt[:, None], weights, np.eye(3 * CONTACTS))
+    truth = np.array([least(*rows_of(hand, lane), margin[lane], own[lane]) for lane in np.flatnonzero(holds)])
     unit = 1e-3 * np.abs(weights[holds]).max((1, 2)) * 6.0**2
     assert np.max(np.abs(found.effort[holds] - truth) / np.maximum(truth, unit)) <= 1e-7
     # No forces take smaller torques, up to what the lever adds.
