@@ -43,7 +43,7 @@ from jaxgrasp.solvers.status import Status
 _FREE = FORMULATIONS["13"]
 _SETTINGS = {
     "float64": Settings(
-        tolerance=1e-8, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=8
+        tolerance=1e-9, max_iterations=40, step_cap=1e-4, mu_floor=0.0, equal_steps=True, safeguard=1e-4, patience=4
     ),
     "float32": Settings(
         tolerance=1e-4, max_iterations=40, step_cap=1e-3, mu_floor=1e-8, equal_steps=True, safeguard=1e-3, patience=5
