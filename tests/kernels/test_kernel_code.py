@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from jax import lax
 
+import jaxgrasp as jg
 from jaxgrasp import kernels
 from jaxgrasp.disturbance.sets import support
 from jaxgrasp.disturbance.vertices import Vertices
 from jaxgrasp.kernels import primitive
 from jaxgrasp.kernels.cpu.module import write_module
 from jaxgrasp.kernels.program.lowering import lower
-from jaxgrasp.lanes.fence import loops
+from jaxgrasp.lanes.fence import loops, repeat
 
 ROUNDING = {"float64": 1e-13, "float32": 2e-5}
 """Relative, for short functions: reciprocals are good to a unit or two in the last place."""
@@ -208,6 +209,41 @@ def test_long_loops_read_what_all_problems_share():
         return lax.fori_loop(0, 32, body, jnp.zeros(1))
 
     assert_same(function, rows(30, 3), rows(128, 3, seed=1), shared=(False, True))
+
+
+def test_large_loops_read_what_they_carry():
+    """A round that slices what the rounds before it computed is written out, however much it computes."""
+
+    def function(x):
+        with loops():
+            return repeat(4, lambda i, x: jnp.where(x > 0, x + x[i] * x[i], x), x)
+
+    assert_same(function, rows(9, 6, 500))
+
+
+def test_grasps_of_twenty_contacts_have_kernels(monkeypatch):
+    """As many as a hand has links; of (21), and of (22), whose program is the larger one."""
+
+    class Lowered(Exception):
+        pass
+
+    def stop(plan, name):
+        lower(plan.trace(), list(plan.shared))
+        raise Lowered
+
+    def solve(normals, margin):
+        grasp = jg.Contacts.from_normals(0.03 * normals, normals, friction=0.6, max_force=6.0)
+        forces, weight = jg.DisturbanceSet.forces(1.0), jnp.zeros((2, 6))
+        if margin is None:
+            return jg.largest_disturbance(grasp, forces, weight).margin
+        return jg.least_effort(grasp, forces, margin, weight).forces
+
+    monkeypatch.setattr(primitive, "_compile", stop)
+    monkeypatch.setattr(primitive.folder, "read", lambda _: None)
+    monkeypatch.setattr(primitive.folder, "keep", lambda *_: None)
+    for margin in (None, jnp.ones(2)):
+        with pytest.raises(Lowered):
+            jax.jit(solve).lower(rows(2, 20, 3), margin)
 
 
 def test_the_example_of_the_compilers_map(capsys):

@@ -13,7 +13,7 @@ _SHORT, _COUNTED, _STACKED = 2, 16, 64
 # gains nothing by knowing the counter, and compiles for as long as there are rounds.
 _MOST_UNROLLED = 1 << 13
 # The most entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
-MOST_ENTRIES = 400_000
+MOST_ENTRIES = 600_000
 
 
 def entries_of(jaxpr: Jaxpr) -> int:
@@ -32,4 +32,14 @@ def may_unroll(params: dict, counted: bool = True) -> bool:
     stacks = len(body.jaxpr.outvars) > params["num_carry"]
     if length <= _SHORT or (stacks and length <= _STACKED):
         return True
-    return counted and length <= _COUNTED and length * entries_of(body.jaxpr) <= _MOST_UNROLLED
+    if not counted or length > _COUNTED:
+        return False
+    return _slices_carried(params) or length * entries_of(body.jaxpr) <= _MOST_UNROLLED
+
+
+def _slices_carried(params: dict) -> bool:
+    """Tell whether a round slices, at its counter, what rounds before it computed; a loop has no code for that."""
+    body, n_consts = params["jaxpr"].jaxpr, params["num_consts"]
+    carried = body.invars[n_consts : n_consts + params["num_carry"]]
+    sliced = [eqn.invars[0] for eqn in body.eqns if eqn.primitive.name.startswith("dynamic_")]
+    return any(x is y for x in sliced for y in carried)
