@@ -241,6 +241,8 @@ def _warn(why: str) -> None:
     )
 
 
+# What is kept on disk for a program that there is no kernel for: to find that out takes seconds.
+_NONE = b""
 # Names of the kernels of this process by the keys of their plans; None where there is no kernel.
 _registered: dict[str, str | None] = {}
 
@@ -266,9 +268,15 @@ def register(plan: Plan) -> str:
 def _load(plan: Plan) -> str:
     target, name = _TARGETS[plan.platform], f"jaxgrasp_{plan.key[:32]}"
     code = folder.read(plan.key)
+    if code == _NONE:
+        raise Unsupported("known from an earlier process")
     try:
         if code is None:
-            code = _compile(plan, name)
+            try:
+                code = _compile(plan, name)
+            except Unsupported:
+                _keep(plan.key, _NONE)
+                raise
             _keep(plan.key, code)
         address = target.load_handler(code, name)
     except RuntimeError as error:

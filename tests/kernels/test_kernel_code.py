@@ -274,6 +274,16 @@ def test_what_cannot_be_fused_is_left_to_xla():
     np.testing.assert_array_equal(left, rows(3, 4) * 2)
 
 
+def test_what_has_no_kernel_is_known_from_disk(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    one = [jax.ShapeDtypeStruct((4, 1), jnp.float64)]
+    plan = primitive._make_plan(lambda parts: jnp.fft.fft(parts[0][:, 0]).real[:, None], one, (False,), None, "cpu")
+    with pytest.raises(primitive.Unsupported, match="complex"):
+        primitive._load(plan)
+    with pytest.raises(primitive.Unsupported, match="earlier"):
+        primitive._load(plan)
+
+
 @pytest.mark.parametrize(
     "function",
     [lambda w: w & 3, lambda w: 8 | w, lambda w: w ^ w[::-1], lambda w: ~w, jnp.abs, lambda w: lax.reduce_and(w, (0,))],
