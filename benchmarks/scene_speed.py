@@ -3,7 +3,8 @@
 FOLDER has an object's convex `pieces` and `grasps.npz`, in the layout of DexGraspBench. `jaxgrasp rank` is run as a
 command of its own: first with nothing on disk, then again with programs and kernels there, then with 10,000
 configurations (the file's, each moved a little), twice; with the scene's actuators and without. The rate is of what the
-10,000 take longer than the file's own. Writes scene_speed.md beside this file.
+10,000 take longer than the file's own. Beside the seconds are those of all processors together, which hardly depend on
+what else the machine does. Writes scene_speed.md beside this file.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ def many(path: Path, out: Path) -> None:
     np.savez(out, **table | {"grasp_qpos": qpos})
 
 
-def ranked(hand: Path, folder: Path, grasps: Path, cache: Path, actuators: str) -> tuple[float, float]:
-    """Seconds that the command takes, and its peak of memory, GiB."""
+def ranked(hand: Path, folder: Path, grasps: Path, cache: Path, actuators: str) -> tuple[float, float, float]:
+    """Seconds that the command takes, those of processors, and its peak of memory, GiB."""
     command = [sys.executable, "-m", "jaxgrasp.cli", "rank", "--hand", str(hand), "--object", str(folder / "pieces")]
     command += [*TRIAL, "--grasps", str(grasps), "--output", str(cache / "ranking.parquet"), "--figure", "None"]
     start = time.perf_counter()
@@ -54,7 +55,7 @@ def ranked(hand: Path, folder: Path, grasps: Path, cache: Path, actuators: str) 
     if status:
         raise SystemExit(f"rank ended with {status}")
     unit = 2**30 if sys.platform == "darwin" else 2**20
-    return time.perf_counter() - start, usage.ru_maxrss / unit
+    return time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / unit
 
 
 def main() -> None:
@@ -70,7 +71,9 @@ def main() -> None:
         f"Object {folder.name} of {len(list((folder / 'pieces').iterdir()))} pieces; {platform.machine()}, "
         f"{os.cpu_count()} cores, load {busy:.1f}. Made by `python -m benchmarks.scene_speed HAND FOLDER`.",
         "",
-        f"| | nothing on disk, s | programs on disk, s | {COUNT:,} more, first, s | again, s | a second | peak, GiB |",
+        "Seconds, and in brackets those of all processors.",
+        "",
+        f"| | nothing on disk | programs on disk | {COUNT:,} more, first | again | a second | peak, GiB |",
         "|---|---|---|---|---|---|---|",
     ]
     with tempfile.TemporaryDirectory() as name:
@@ -82,9 +85,10 @@ def main() -> None:
             runs = [
                 ranked(hand, folder, grasps, cache, actuators) for grasps in 2 * [folder / "grasps.npz"] + 2 * [out]
             ]
-            (cold, warm, first, again), peaks = zip(*runs, strict=True)
-            seconds = " | ".join(f"{x:.1f}" for x in (cold, warm, first, again))
-            lines.append(f"| `{actuators}` | {seconds} | {COUNT / (again - warm):,.0f} | {max(peaks):.2f} |")
+            seconds, busy_seconds, peaks = zip(*runs, strict=True)
+            cells = " | ".join(f"{x:.1f} ({y:.1f})" for x, y in zip(seconds, busy_seconds, strict=True))
+            _, warm, _, again = seconds
+            lines.append(f"| `{actuators}` | {cells} | {COUNT / (again - warm):,.0f} | {max(peaks):.2f} |")
             print(lines[-1], flush=True)
     Path(__file__).with_suffix(".md").write_text("\n".join(lines) + "\n")
 
