@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxgrasp.geometry.grid import DistanceGrid
-from jaxgrasp.geometry.mesh_files import COSTS, TRIANGLE, read_triangles
+from jaxgrasp.geometry.mesh_files import BYTE, TRIANGLE, read_triangles
 from jaxgrasp.geometry.triangle_tree import TriangleTree
 from jaxgrasp.geometry.triangles import signed_distances
 from jaxgrasp.storage import FileError, allowance, open_regular, printable, reason_of
@@ -80,7 +80,7 @@ class Mesh:
             raise MeshError(f"{path}: got the ending {path.suffix!r}, wanted one of {', '.join(MESH_ENDINGS)}")
         kind = path.suffix[1:].lower()
         try:
-            with open_regular(path, "an intact mesh", cost=COSTS[kind]) as stream:
+            with open_regular(path, "an intact mesh", cost=BYTE) as stream:
                 vertices, faces = read_triangles(stream.read(), kind, allowance() // TRIANGLE)
         except FileError as error:
             raise MeshError(str(error)) from error

@@ -18,11 +18,14 @@ Triangles = tuple[np.ndarray, np.ndarray]
 _Polygons = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices, the corners of all faces one after the other, and how many each face has."""
 
-# Bytes of memory that a byte of a file, and a triangle, may take until distances are known; OBJ takes time, too.
-COSTS, TRIANGLE = {"stl": 40, "ply": 40, "obj": 100}, 2048
+# Bytes of memory that a byte of a file, and a triangle, may take until distances are known.
+BYTE, TRIANGLE = 40, 2048
 _LINE, _HEADER = 4096, 1 << 16
-_CORNER = re.compile(rb"^\s*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE | re.IGNORECASE)
-_FRACTION = re.compile(rb"^[ \t]*v(?:[ \t]+[^\s/]+){0,2}[ \t]+[^\s/]*/", re.MULTILINE)
+_CORNER = re.compile(rb"^\s*vertex[ \t]+(\S+[ \t]+\S+[ \t]+\S+)", re.MULTILINE | re.IGNORECASE)
+# In lines of OBJ: one that goes on in the next, up to three words of a vertex, and all of a face.
+_CONTINUED = re.compile(rb"\\[ \t\r\f\v]*(?:\n|\Z)")
+_VERTEX = re.compile(rb"^[ \t\r\f\v]*v(?=\s)[ \t\r\f\v]*(\S*[ \t\r\f\v]*\S*[ \t\r\f\v]*\S*)", re.MULTILINE)
+_FACE = re.compile(rb"^[ \t\r\f\v]*f((?=\s).*\n)", re.MULTILINE)
 _LAST_LINE = re.compile(rb"^\s*endsolid\b[^\n]*\s*\Z", re.MULTILINE | re.IGNORECASE)
 _FACETS = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -79,15 +82,11 @@ def _check_lines(content: bytes) -> None:
         raise ValueError(f"a line of more than {_LINE:,} characters")
 
 
-def _plain(word: bytes) -> bytes:
-    """A number's text without what Python alone would read."""
-    if b"_" in word:
-        raise ValueError(f"a number {word.decode('latin-1')!r}")
-    return word
-
-
-def _number(word: bytes) -> float:
-    return float(_plain(word))
+def _numbers(text: bytes, kind: type = float) -> np.ndarray:
+    """Numbers with space between them, in the spelling that is common to all languages."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return np.fromstring(text.strip(), kind, sep=" ")
 
 
 def _stl(content: bytes) -> _Polygons:
@@ -99,10 +98,7 @@ def _stl(content: bytes) -> _Polygons:
         _check_lines(content)
         if not _LAST_LINE.search(content[-_LINE:]):
             raise ValueError("the file ends early")
-        numbers = array("d")
-        for corner in _CORNER.finditer(content):
-            numbers.extend(map(_number, corner.groups()))
-        corners = np.array(numbers).reshape(-1, 3)
+        corners = _numbers(b" ".join(_CORNER.findall(content))).reshape(-1, 3)
     else:
         raise ValueError(f"{len(content):,} bytes where {count:,} triangles are declared")
     if len(corners) % 3:
@@ -117,28 +113,25 @@ def _stl(content: bytes) -> _Polygons:
 
 
 def _obj(content: bytes) -> _Polygons:
+    content = _CONTINUED.sub(b" ", content) + b"\n"
     _check_lines(content)
-    points, corners, counts = array("d"), array("q"), array("q")
-    if _FRACTION.search(content):
-        raise ValueError("a vertex of fractions")
+    rows = _VERTEX.findall(content)
+    points = _numbers(b" ".join(rows))
+    if len(points) != 3 * len(rows):
+        raise ValueError("a vertex of fewer than three numbers")
     # Of normals and textures nothing is kept.
-    lines = iter(io.BytesIO(re.sub(rb"/\S*", b"", content)))
-    for line in lines:
-        while line.rstrip().endswith(b"\\") and len(line) <= _LINE:
-            line = line.rstrip()[:-1] + b" " + next(lines, b"")
-        words = line.split()
-        if words[:1] == [b"v"]:
-            if len(words) < 4:
-                raise ValueError("a vertex of fewer than three numbers")
-            points.extend(map(_number, words[1:4]))
-        elif words[:1] == [b"f"]:
-            indices = [int(_plain(word)) for word in words[1:]]
-            if min(indices, default=0) <= 0:
-                # Counted backwards from the last vertex; 0 is none.
-                indices = [i if i >= 0 else len(points) // 3 + 1 + i for i in indices]
-            corners.extend(indices)
-            counts.append(len(indices))
-    return np.array(points).reshape(-1, 3), np.array(corners, int) - 1, np.array(counts, int)
+    faces = re.sub(rb"/\S*", b"", b"".join(_FACE.findall(content)))
+    corners = _numbers(faces, int)
+    text = np.frombuffer(b" " + faces, np.uint8)
+    blank = text <= ord(" ")
+    words, ends = np.flatnonzero(blank[:-1] & ~blank[1:]), np.flatnonzero(text == ord("\n"))
+    counts = np.diff(np.searchsorted(words, ends), prepend=0)
+    if (corners < 0).any():
+        # Counted backwards from the last vertex before the face.
+        of_points, of_faces = ([found.start() for found in kind.finditer(content)] for kind in (_VERTEX, _FACE))
+        before = np.repeat(np.searchsorted(of_points, of_faces), counts)
+        corners = np.where(corners < 0, before + 1 + corners, corners)
+    return points.reshape(-1, 3), corners - 1, counts
 
 
 class _Property(NamedTuple):
@@ -165,7 +158,9 @@ def _ply(content: bytes) -> _Polygons:
     data, at, found = memoryview(content)[end.end() :], 0, {}
     if order is None:
         # Numbers of text are as good as any in binary.
-        data, order = _numbers(content[end.end() :]), "="
+        text, order = content[end.end() :], "="
+        _check_lines(text)
+        data = _numbers(text).data.cast("B")
     for element in elements:
         if element.name in found:
             raise ValueError(f"two elements {element.name!r}")
@@ -179,13 +174,6 @@ def _ply(content: bytes) -> _Polygons:
         raise ValueError("corners that are no whole numbers")
     points = np.stack([vertex[axis][0] for axis in "xyz"], -1)
     return points.astype(float), corners.astype(np.int64, copy=False), counts
-
-
-def _numbers(text: bytes) -> memoryview:
-    _check_lines(text)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        return np.fromstring(text, sep=" ").data.cast("B")
 
 
 def _columns(
