@@ -162,11 +162,14 @@ def _squared_distance(a: Vector, b: Vector, c: Vector) -> Array:
     edges = [(a, _subtract(b, a)), (b, _subtract(c, b)), (c, _subtract(a, c))]
     normal = _cross(edges[0][1], edges[1][1])
     beside = [_dot(_cross(edge, normal), corner) for corner, edge in edges]
-    flat = _dot(normal, normal)
-    above = (beside[0] >= 0) & (beside[1] >= 0) & (beside[2] >= 0) & (flat > 0)
-    height = _dot(normal, a) ** 2 / jnp.where(flat > 0, flat, 1)
+    whole = beside[0] + beside[1] + beside[2]
+    above = (beside[0] >= 0) & (beside[1] >= 0) & (beside[2] >= 0) & (whole > 0)
+    # A mean of the corners is on the triangle, however narrow that is and wherever rounding turns its normal.
+    c_, a_, b_ = (jnp.where(above, part / jnp.where(above, whole, 1), 1) for part in beside)
+    foot = [a_ * p + b_ * q + c_ * r for p, q, r in zip(a, b, c, strict=True)]
     to_edges = [_squared_distance_to_edge(corner, edge) for corner, edge in edges]
-    return jnp.where(above, height, jnp.minimum(jnp.minimum(to_edges[0], to_edges[1]), to_edges[2]))
+    inside = jnp.where(above, _dot(foot, foot), jnp.inf)
+    return jnp.minimum(jnp.minimum(inside, to_edges[0]), jnp.minimum(to_edges[1], to_edges[2]))
 
 
 def _squared_distance_to_edge(corner: Vector, edge: Vector) -> Array:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 
 from jaxgrasp.geometry import Mesh, MeshError
 from jaxgrasp.geometry.triangle_tree import BLOCK, LEAF, Blocks, TriangleTree
+from jaxgrasp.geometry.triangles import _squared_distance
 from jaxgrasp.storage import limited_to
 
 # Of the whole extent: single precision.
@@ -107,3 +110,15 @@ def test_what_would_take_minutes_is_refused():
     mesh = Mesh(vertices=vertices, faces=np.array([*itertools.combinations(range(60), 3)]))
     with limited_to(1 << 27), pytest.raises(MeshError, match=r"long or overlap, wanted evenly shaped ones \(remesh it"):
         mesh.to_grid()
+
+
+def test_slivers_are_no_nearer_than_they_are():
+    """Single precision turns the normals of triangles without area anywhere; a few in a million then pass a point."""
+    draw = np.random.default_rng(0)
+    ends = np.round(draw.normal(size=(2, 200_000, 3)), 1)
+    corners = np.stack([ends[0], ends[1], 2 * ends[1] - ends[0]]) - draw.uniform(-3, 3, (200_000, 3))
+    found = np.sqrt(jax.jit(_squared_distance)(*jnp.asarray(corners.swapaxes(1, 2), jnp.float32)))
+    along = corners[2] - corners[0]
+    share = np.clip(-(corners[0] * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-30), 0, 1)
+    distance = np.linalg.norm(corners[0] + share[:, None] * along, axis=-1)
+    np.testing.assert_allclose(found, distance, atol=ROUNDING * 3)
