@@ -99,6 +99,28 @@ def specified(dtype, kind):
     return jg.specified_disturbances(contacts, vertices, kind, load)
 
 
+def measured(dtype, metric, n_c=4, cone_edges=4, torsion=None, families=FAMILIES, moved=lambda c: c):
+    """One of the field's metrics; every other contact is soft where there is torsion."""
+    contacts = harness.data_of(batch(n_c, families), dtype)[0]
+    if torsion is not None:
+        arms = torsion * contacts.friction * jnp.asarray(np.arange(n_c) % 2, dtype)
+        contacts = replace(contacts, torsional_friction=arms)
+    return metric(moved(contacts), jg.metrics.WrenchSpace(cone_edges=cone_edges))
+
+
+def gradient_of_metric(dtype, metric):
+    """With respect to positions and friction."""
+    contacts = harness.data_of(batch(4, PLAIN), dtype)[0]
+
+    def total(positions, friction):
+        values = measured(
+            dtype, metric, families=PLAIN, moved=lambda c: replace(c, positions=positions, friction=friction)
+        )
+        return jnp.where(jnp.isfinite(values), values, 0).sum()
+
+    return jax.jit(jax.grad(total, (0, 1)))(contacts.positions, contacts.friction)
+
+
 def actuation(dtype):
     rng = np.random.default_rng(4)
     jacobian, limits = 0.05 * rng.normal(size=(LANES, 3, 3, 7)), 0.6 * np.ones(5)
@@ -179,6 +201,12 @@ GROUPS: dict[str, dict[str, Program]] = {
         ),
         "specified, (6)": partial(specified, kind="6"),
         "specified, (9)": partial(specified, kind="9"),
+    },
+    "metrics": {
+        "closure": partial(measured, metric=jg.metrics.force_closure),
+        "closure, 3": partial(measured, metric=jg.metrics.force_closure, n_c=3, cone_edges=8),
+        "closure, soft": partial(measured, metric=jg.metrics.force_closure, torsion=0.1),
+        "derivatives of min-weights": partial(gradient_of_metric, metric=jg.metrics.min_weight),
     },
     "derivatives": {
         "of forces": partial(gradient, of=margin, field="forces", power=2),

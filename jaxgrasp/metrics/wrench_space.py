@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgrasp.arrays import as_float, broadcast_batch, safe_norm
+from jaxgrasp.arrays import as_float, broadcast_batch, fold_last, safe_norm
 from jaxgrasp.compiling import compiled, own_settings
 from jaxgrasp.contact import Contacts
 from jaxgrasp.contact.contacts import rotations
@@ -169,7 +169,7 @@ def _edges(contacts: Contacts, space: WrenchSpace) -> Edges:
     if space.unit_edges:
         forces = forces / jnp.sqrt(1 + friction * friction)[..., None, None]
     blocks = jnp.where(present[..., None, None], blocks, 0)
-    wrenches = jnp.einsum("...cra,...cea->...cer", blocks, forces)
+    wrenches = fold_last(jnp.add, blocks[..., None, :, :] * forces[..., None, :])
     return Edges(wrenches, present, valid, blocks, length, forces, soft)
 
 

@@ -25,7 +25,7 @@ TOLERANCE = {"float64": 2e-8, "float32": 1e-4}
 POINTS = {"float64": 1e-5, "float32": 2e-2}
 """Of forces and their derivatives, which gaps determine less well."""
 
-LOOSE = ("forces", "effort", "actuator", "blocking", "changes")
+LOOSE = ("forces", "effort", "actuator", "blocking", "changes", "twist", "moments")
 
 NOISE = ("residual", "gap", "iterations", "multipliers")
 """What rounding decides, or a gap of rounding: kernels agree with each other on it."""
