@@ -1,0 +1,153 @@
+"""The field's metrics that have kernels: rates beside the margin's, and every answer against HiGHS.
+
+    python -m benchmarks.metric_kernels [--quick]
+
+writes metric_kernels.md beside itself (--quick: fewer grasps, writes nothing). HiGHS solves the programs of many grasps
+side by side, as one program of blocks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import jax
+import numpy as np
+import scipy.sparse as sp
+from scipy.optimize import linprog
+
+import jaxgrasp as jg
+from benchmarks.suite.clock import Job, by_turns, say, warn_if_busy
+from jaxgrasp import metrics
+from jaxgrasp.candidates import sample_grasps
+from jaxgrasp.kernels.code import llvm
+
+BATCH, ROUNDS = 16_384, 7
+CHECKED, TOGETHER, CHUNK = 20_000, 16, 512
+HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10, "presolve": False}
+RANK = 1e-9
+"""Singular values below this share of the largest are zero."""
+
+
+def rates() -> list[str]:
+    """Grasps a second, by turns."""
+    found = sample_grasps(BATCH, seed=1)
+    task = jg.DisturbanceSet.forces(1.0)
+    lines = ["| precision | | grasps/s | of the margin's | cpu/wall |", "|---|---|---|---|---|"]
+    for dtype in ("float64", "float32"):
+        given = (np.asarray(x, dtype) for x in (found.positions, found.outward_normals))
+        scalars = {name: np.asarray(getattr(found, name), dtype) for name in ("friction", "max_force")}
+        contacts = jg.Contacts.from_normals(*given, **scalars)
+        programs: dict[str, Callable] = {
+            "margin": lambda c: jg.largest_disturbance(c, task).margin,
+            "min_weight": metrics.min_weight,
+            "force_closure": metrics.force_closure,
+            "closure_residual": metrics.closure_residual,
+        }
+        jobs: dict[str, Job] = {
+            name: functools.partial(run, jax.jit(program), contacts) for name, program in programs.items()
+        }
+        timings = by_turns(jobs, ROUNDS)
+        for name, timing in timings.items():
+            share = timings["margin"].seconds / timing.seconds
+            rate = f"{BATCH / timing.seconds:,.0f}"
+            lines.append(f"| {dtype} | {name} | {rate} | {share:.2f} | {timing.cpu_per_wall:.2f} |")
+    return lines
+
+
+def run(program: Callable, contacts: jg.Contacts) -> None:
+    jax.block_until_ready(program(contacts))
+
+
+def checked_grasps(count: int) -> jg.Contacts:
+    """Random grasps of a thumb and three fingers; of eight, one from one side, and one with its contacts on a line."""
+    found = sample_grasps(count, seed=2)
+    rng = np.random.default_rng(3)
+    positions, normals = found.positions.copy(), np.array(found.outward_normals)
+    # From one side no contact pushes down.
+    normals[::8, :, 2] = np.abs(normals[::8, :, 2]) + 1
+    line = rng.normal(size=(len(positions[4::8]), 1, 3))
+    positions[4::8] = 0.03 * line * rng.uniform(-1, 1, (len(line), 4, 1))
+    return jg.Contacts.from_normals(positions, normals, friction=0.6, max_force=1.0)
+
+
+def least_weights(W: np.ndarray) -> np.ndarray:
+    """The min-weights of grasps (k, m, 6) by HiGHS, times m; -inf where there are none."""
+    k, m = W.shape[:2]
+    # z >= 0, l free:  W'z + l W'1 = 0,  1'z + m l = 1.
+    blocks = []
+    for w in W:
+        rows = np.column_stack([w.T, w.sum(0)])
+        blocks.append(np.vstack([rows, np.append(np.ones(m), m)]))
+    cost = np.tile(np.append(np.zeros(m), -1.0), k)
+    side = np.tile(np.append(np.zeros(6), 1.0), k)
+    bounds = np.tile(np.vstack([np.tile([0, np.inf], (m, 1)), [[-np.inf, np.inf]]]), (k, 1))
+    found = linprog(cost, A_eq=sp.block_diag(blocks, "csc"), b_eq=side, bounds=bounds, method="highs", options=HIGHS)
+    if found.status == 0:
+        return m * found.x.reshape(k, m + 1)[:, -1]
+    return np.full(1, -np.inf) if k == 1 else np.concatenate([least_weights(w[None]) for w in W])
+
+
+def answers(W: np.ndarray) -> np.ndarray:
+    """Min-weights, times the number of edges."""
+    least = np.concatenate([least_weights(W[i : i + TOGETHER]) for i in range(0, len(W), TOGETHER)])
+    singular = np.linalg.svd(W, compute_uv=False)
+    # By definition: edges that do not span the space close nothing.
+    return np.where(singular[:, 5] <= RANK * singular[:, 0], np.minimum(least, 0), least)
+
+
+def checks(count: int) -> list[str]:
+    """The largest differences from HiGHS."""
+    contacts, space = checked_grasps(count), metrics.WrenchSpace()
+    W = np.asarray(metrics.edge_wrenches(contacts, space)).reshape(count, -1, 6)
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        least = np.concatenate(list(pool.map(answers, [W[i : i + CHUNK] for i in range(0, count, CHUNK)])))
+    found = jax.tree.map(np.asarray, metrics.force_closure(contacts, space))
+    ours, finite = found.min_weight * W.shape[1], np.isfinite(least)
+    assert (ours[~finite] == least[~finite]).all()
+    difference = np.abs(ours - least)[finite]
+    relative = difference / np.maximum(np.abs(least[finite]), 1e-2)
+    wrong = (found.closed != (least > 1e-7)).sum()
+    return [
+        f"{count:,} grasps, of which {(~found.closed).mean():.0%} have no force closure; {np.isnan(ours).sum()} are "
+        f"unsolved. Min-weights, times the number of edges, differ by at most {np.nanmax(difference):.1e}, and by "
+        f"{np.nanmax(relative):.1e} of the larger of themselves and 0.01. `force_closure` differs on {wrong} of them "
+        "from HiGHS' min-weight above 1e-7."
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="fewer grasps are checked; writes nothing")
+    quick = parser.parse_args().quick
+    jax.config.update("jax_enable_x64", True)
+    load = warn_if_busy()
+    text = "\n".join(
+        [
+            "# Metrics by kernels",
+            "",
+            f"`python -m benchmarks.metric_kernels`, {os.cpu_count()} cores, "
+            f"{llvm.processor().description.split(',')[0]}, load average at the start {load:.1f}.",
+            "",
+            f"Four contacts, eight edges, batch {BATCH:,}, in a `jax.jit`, warm, by turns, best of {ROUNDS}.",
+            "",
+            *rates(),
+            "",
+            "## Against HiGHS, float64",
+            "",
+            *checks(512 if quick else CHECKED),
+            "",
+        ]
+    )
+    say(text)
+    if not quick:
+        (Path(__file__).parent / "metric_kernels.md").write_text(text)
+
+
+if __name__ == "__main__":
+    main()
