@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 jax.config.update("jax_enable_x64", True)
 
 import jaxgrasp as jg  # noqa: E402
-from jaxgrasp.viewer import draw_grasp, write_figure  # noqa: E402
+from jaxgrasp.viewer import common_scale, draw_grasp, write_figure  # noqa: E402
 
 # A thumb against three fingers on a ball of 3 cm radius and 0.1 kg.
 directions = jnp.array([[-1.0, 0.0, 0.1], [0.8, -0.6, 0.2], [0.8, 0.6, 0.2], [0.9, 0.0, -0.7]])
@@ -41,10 +41,10 @@ in_object_frame = np.einsum("cij,...cj->...ci", contacts.frames, jnp.stack([tigh
 figure = Figure(figsize=(10.0, 5.0), layout="constrained", dpi=150)
 titles = ("Tightening forces; black: weight", f"With blocking forces; black: push of {wanted:.2f} N")
 loads = (np.array([0.0, 0.0, -1.0]), np.asarray(wrenches[worst, :3]))
-scale = None
+scale = common_scale([np.asarray(contacts.positions)] * 2, in_object_frame)
 for place in range(2):
     axes = figure.add_subplot(1, 2, place + 1, projection="3d", proj_type="ortho")
-    scale = draw_grasp(
+    draw_grasp(
         axes,
         np.asarray(contacts.positions),
         np.asarray(normals),

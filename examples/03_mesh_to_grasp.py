@@ -14,7 +14,7 @@ from jaxgrasp.candidates import read_candidates  # noqa: E402
 from jaxgrasp.geometry import Mesh, sample_surface  # noqa: E402
 from jaxgrasp.ranking import rank  # noqa: E402
 from jaxgrasp.synthesis import synthesize  # noqa: E402
-from jaxgrasp.viewer import draw_grasp, write_figure  # noqa: E402
+from jaxgrasp.viewer import common_scale, draw_grasp, write_figure  # noqa: E402
 
 # A bottle of 13 cm, by its outline (radius, height), turned about z into triangles; any .stl, .obj or .ply does.
 OUTLINE = np.array([(0.0, 0.0), (0.028, 0.0), (0.032, 0.004), (0.032, 0.07), (0.014, 0.1), (0.014, 0.128), (0.0, 0.13)])
@@ -60,10 +60,12 @@ ranking = rank(read_candidates(["bottle_grasps.npz"]), pushes, gravity=9.81, top
 print("the best two while bearing 0.3 kg:", np.round(ranking.margin[ranking.order[:2]], 2))
 
 figure = Figure(figsize=(10.0, 5.0), layout="constrained", dpi=150)
-for place, row in enumerate(ranking.order[:2]):
+best = ranking.order[:2]
+scale = common_scale(found.positions[best], found.forces[best])
+for place, row in enumerate(best):
     axes = figure.add_subplot(1, 2, place + 1, projection="3d", proj_type="ortho")
     grasp = (found.positions[row], found.outward_normals[row], found.forces[row])
-    scale = draw_grasp(axes, *grasp, friction=np.full(4, 0.6), surface=points - mesh.centroid)
+    draw_grasp(axes, *grasp, friction=np.full(4, 0.6), surface=points - mesh.centroid, scale=scale)
     axes.set_title(f"#{place + 1}: $\\lambda = {found.margin[row]:.2f}$; 1 mm = {scale:.2g} N", fontsize=10, y=1.05)
 write_figure(figure, "mesh_to_grasp.png")
 print("written: mesh_to_grasp.png")

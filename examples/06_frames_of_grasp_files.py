@@ -5,6 +5,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
+from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import proj3d
 
 from jaxgrasp.files import GraspSet, HandPoses, read_grasps, write_grasps
@@ -66,5 +67,6 @@ for label, (pose, shift) in LABELS.items():
     x, y, _ = proj3d.proj_transform(*pose[:3], axes.get_proj())
     arrow = {"arrowstyle": "-", "color": "0.4"}
     axes.annotate(label, (x, y), shift, textcoords="offset points", fontsize=10, arrowprops=arrow, zorder=5)
-figure.savefig("grasp_frames.png", dpi=110, bbox_inches="tight")
+# Without the white above and below, which is part of the axes.
+figure.savefig("grasp_frames.png", dpi=110, bbox_inches=Bbox([[1.3, 1.4], [8.6, 5.3]]))
 print("written: grasp_frames.png")

@@ -93,5 +93,5 @@ def named_disturbances(name: str) -> "tuple[DisturbanceSet, str]":
     if name == "ball":
         return DisturbanceSet.ball(force=1.0), "N"
     if name == "box":
-        return DisturbanceSet.box(jnp.array(BOX)), "boxes"
+        return DisturbanceSet.box(jnp.array(BOX)), "× (1 N, 0.02 N m)"
     return DisturbanceSet.vertices(jnp.asarray(read_wrenches(name))), "times the file's"

@@ -1,7 +1,7 @@
 """One grasp in 3D: contacts, outward normals, friction cones and the forces of the fingers."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ def draw_grasp(
         load: A direction in which a weight pulls at the centre of mass, drawn as an arrow.
         surface: Points on the object that hint at its shape, m.
         held: The hand and the object around the contacts; the names of links are then listed beside the panel.
-        scale: Newtons per millimetre of the drawing; chosen so that the longest arrow fits where None.
+        scale: Newtons per millimetre of the drawing, see `common_scale`; None is the one for this grasp alone.
         colours: One a contact, in turn.
 
     Returns:
@@ -59,7 +59,7 @@ def draw_grasp(
     reach = float(np.linalg.norm(points, axis=-1).max())
     strength = np.nan_to_num(np.linalg.norm(forces, axis=-1))
     if scale is None:
-        scale = round_scale(float(strength.max()) / (0.75 * reach)) if strength.any() else np.nan
+        scale = common_scale([positions[present]], [forces])
     limit = (_LIMIT if held is None else _LIMIT_OF_HAND) * reach
     _frame(axes, points, limit)
     if held is not None:
@@ -84,6 +84,26 @@ def draw_grasp(
     if load is not None:
         _draw_arrow(axes, np.zeros(3), 0.6 * reach * load / np.linalg.norm(load), "black", 0.16 * reach)
     return scale
+
+
+def common_scale(
+    positions: Iterable[Float[np.ndarray, "contacts 3"]], forces: Iterable[Float[np.ndarray, "contacts 3"]]
+) -> float:
+    """Find one scale for the arrows of several grasps, so that panels can be compared.
+
+    Args:
+        positions: Contact positions of each grasp in the object frame, m.
+        forces: Forces of each grasp, N; NaN where there are none.
+
+    Returns:
+        Newtons per millimetre of the drawing with which the longest arrow fits in its panel; NaN without forces.
+    """
+    longest = [
+        np.nan_to_num(np.linalg.norm(each, axis=-1)).max()
+        / (0.75 * _MILLIMETRES * np.linalg.norm(places, axis=-1).max())
+        for places, each in zip(positions, forces, strict=True)
+    ]
+    return round_scale(float(max(longest))) if max(longest) > 0.0 else np.nan
 
 
 def round_scale(newtons: float) -> float:

@@ -16,7 +16,7 @@ from jaxgrasp.ranking import Ranking
 from jaxgrasp.ranking.sketch import NOTHING, Sketch
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.storage import atomic_write
-from jaxgrasp.viewer.grasp import CONTACT_COLOURS, draw_grasp
+from jaxgrasp.viewer.grasp import CONTACT_COLOURS, common_scale, draw_grasp
 from jaxgrasp.viewer.held import Held
 
 _SURFACE_POINTS = 1500
@@ -56,11 +56,16 @@ def figure_of_ranking(
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.9), squeeze=False).flat
     _draw_distribution(left.subplots(2, 1, height_ratios=(3, 1)), ranking, unit, sketch)
     columns = min(len(shown), 2)
+    present = [ranking.candidates.active[row] for row in ranking.order[shown]]
+    scale = common_scale(
+        [ranking.candidates.positions[row][there] for row, there in zip(ranking.order[shown], present, strict=True)],
+        [ranking.object_forces[place][there] for place, there in zip(shown, present, strict=True)],
+    )
     for number, place in enumerate(shown, start=1):
         # Added one by one: matplotlib cannot lay out a 3D panel that is there and not visible.
         panel = right.add_subplot(-(-len(shown) // columns), columns, number, projection="3d", proj_type="ortho")
-        _draw_panel(panel, ranking, place, unit, loaded, held and held(int(ranking.order[place])))
-    right.legend(handles=_legend(loaded), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+        _draw_panel(panel, ranking, place, unit, scale, loaded, held and held(int(ranking.order[place])))
+    right.legend(handles=_legend(loaded, scale), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     return figure
 
 
@@ -127,9 +132,11 @@ def _draw_counts(axes: Axes, counts: dict[str, int]) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _draw_panel(panel: Any, ranking: Ranking, place: int, unit: str, loaded: bool, held: Held | None) -> None:
+def _draw_panel(
+    panel: Any, ranking: Ranking, place: int, unit: str, scale: float, loaded: bool, held: Held | None
+) -> None:
     candidates, row = ranking.candidates, ranking.order[place]
-    scale = draw_grasp(
+    draw_grasp(
         panel,
         candidates.positions[row],
         candidates.normals[row],
@@ -139,14 +146,13 @@ def _draw_panel(panel: Any, ranking: Ranking, place: int, unit: str, loaded: boo
         load=np.array([0.0, 0.0, -1.0]) if loaded else None,
         surface=_surface(ranking, row),
         held=held,
+        scale=scale,
     )
     source = Path(candidates.sources[candidates.source[row]]).stem
     name = candidates.columns["object_name"][row] if "object_name" in candidates.columns else source
     margin = f"{ranking.margin[row]:z.3g}" if np.isfinite(ranking.margin[row]) else r"\infty"
     title = f"#{place + 1}: {name}, candidate {candidates.index[row]}\n$\\lambda = {margin}$ {unit}"
-    panel.set_title(
-        f"{title}; arrows: 1 mm = {scale:.2g} N" if np.isfinite(scale) else f"{title}; no forces", fontsize=9, y=1.02
-    )
+    panel.set_title(title, fontsize=9, y=1.02)
 
 
 def _surface(ranking: Ranking, row: int) -> np.ndarray | None:
@@ -159,10 +165,18 @@ def _surface(ranking: Ranking, row: int) -> np.ndarray | None:
     return points[np.isfinite(points).all(axis=-1)]
 
 
-def _legend(loaded: bool) -> list[Line2D | Patch]:
+def _legend(loaded: bool, scale: float) -> list[Line2D | Patch]:
     colour = CONTACT_COLOURS[0]
+    length = f", 1 mm = {scale:.2g} N" if np.isfinite(scale) else ""
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=colour, marker=">", linewidth=2.0, label="tightening force on the object"),
+        Line2D(
+            [],
+            [],
+            color=colour,
+            marker=">",
+            linewidth=2.0,
+            label=f"tightening force on the object{length}",
+        ),
         Patch(facecolor=(*to_rgb(colour), 0.15), edgecolor=colour, label="friction cone"),
         Line2D([], [], color="0.25", linestyle=(0, (3, 2)), label="outward normal"),
         Line2D([], [], color="black", marker="+", linestyle="none", label="centre of mass"),

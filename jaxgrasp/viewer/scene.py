@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -18,6 +19,9 @@ from jaxgrasp.viewer.ranking import write_figure
 _PIXELS = 720
 _INCHES = 4.8
 _LONGEST_ARROW = 0.04
+_ARROW_WIDTH = 0.002
+# MuJoCo draws the groups before this one.
+_HIDDEN_GROUP = 3
 _HAND_ALPHA = 0.35
 
 
@@ -32,9 +36,9 @@ def draw_scenes(
 ) -> None:
     """Renders some configurations of a hand and an object, one panel each, and writes the picture.
 
-    The hand is half transparent. Each finger's force on the object is an arrow that ends at the contact, its length
-    proportional to the force, all panels to the same scale. The view is from the side where the arrows can be
-    seen best.
+    The hand is half transparent and whole in its panel; the arm that carries its palm is left out. Each finger's force
+    on the object is an arrow that ends at the contact, its length proportional to the force. Hands and arrows have the
+    same scale in all panels. The view is from the side where the arrows can be seen best.
 
     Args:
         path: The file; its ending says the format (png, pdf, ...).
@@ -64,9 +68,11 @@ def draw_scenes(
     arrows = forces / (1e3 * newtons_per_mm) if strongest > 0.0 else forces
 
     model = for_pictures(model, of_object)
+    model.geom_rgba[_of_arm(model, of_object), 3] = 0.0
+    panels = [_Panel.of(model, *each) for each in zip(configurations, contact_points, arrows, strict=True)]
+    distance = max(panel.distance for panel in panels)
     with offscreen(model, _PIXELS, _PIXELS) as render:
-        panels = zip(configurations, contact_points, arrows, strict=True)
-        pictures = [render(_scene(model, of_object, *each)) for each in panels]
+        pictures = [render(_scene(model, panel, distance)) for panel in panels]
     write_figure(_compose(pictures, titles, newtons_per_mm), path)
 
 
@@ -86,6 +92,14 @@ def _of_object(model: mujoco.MjModel, body: int | None) -> Bool[np.ndarray, " ge
         return np.isin(model.geom_bodyid, bodies_below(model, body))
     free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     return np.isin(model.body_rootid[model.geom_bodyid], free)
+
+
+def _of_arm(model: mujoco.MjModel, of_object: Bool[np.ndarray, " geoms"]) -> Bool[np.ndarray, " geoms"]:
+    """The geoms of what carries the palm. The palm is the last body that all ends of fingers are below."""
+    others = np.setdiff1d(np.arange(1, model.nbody), model.geom_bodyid[of_object])
+    ends = np.intersect1d(np.setdiff1d(others, model.body_parentid), model.geom_bodyid)
+    carriers = [body for body in others.tolist() if np.isin(ends, bodies_below(model, body)).all()]
+    return np.isin(model.geom_bodyid, carriers[:-1])
 
 
 def for_pictures(
@@ -114,31 +128,66 @@ def for_pictures(
     return model
 
 
-def _scene(
-    model: mujoco.MjModel, of_object: np.ndarray, configuration: np.ndarray, points: np.ndarray, arrows: np.ndarray
-) -> mujoco.MjvScene:
-    data = mujoco.MjData(model)
-    data.qpos[:] = configuration
-    mujoco.mj_forward(model, data)
-    drawn = np.flatnonzero(arrows.any(-1))
-    tips, tails = points[drawn], (points - arrows)[drawn]
-    geoms = np.flatnonzero(of_object)
-    centre = data.geom_xpos[geoms].mean(0)
-    # As wide for short arrows as for the longest: the panels are to be compared.
-    radius = (np.linalg.norm(data.geom_xpos[geoms] - centre, axis=-1) + model.geom_rbound[geoms]).max() + _LONGEST_ARROW
+@dataclass(frozen=True)
+class _Panel:
+    """A configuration and how it is seen."""
 
+    data: mujoco.MjData
+    tails: Float[np.ndarray, "arrows 3"]
+    tips: Float[np.ndarray, "arrows 3"]
+    numbers: list[int]
+    """Of the contacts that have arrows."""
+    view: tuple[float, float]
+    """Azimuth and elevation, degrees."""
+    centre: Float[np.ndarray, "3"]
+    """What the camera looks at, m."""
+    distance: float
+    """The least from which the camera sees hand, object and arrows whole, m."""
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, configuration: np.ndarray, points: np.ndarray, arrows: np.ndarray) -> "_Panel":
+        data = mujoco.MjData(model)
+        data.qpos[:] = configuration
+        mujoco.mj_forward(model, data)
+        drawn = np.flatnonzero(arrows.any(-1))
+        tips, tails = points[drawn], (points - arrows)[drawn]
+        view = _view(tips - tails)
+        # Right, up and forward, as the camera has them.
+        a, e = np.radians(view)
+        forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        right = np.array([np.sin(a), -np.cos(a), 0.0])
+        axes = np.stack([right, np.cross(right, forward), forward])
+        seen = np.concatenate([_corners(model, data), tails]) @ axes.T
+        middle = 0.5 * (seen.min(0) + seen.max(0))
+        sideways = np.abs(seen - middle)[:, :2].max(-1)
+        slope = 0.97 * np.tan(np.radians(0.5 * model.vis.global_.fovy))
+        distance = (sideways / slope - (seen - middle)[:, 2]).max()
+        return cls(data, tails, tips, drawn.tolist(), view, middle @ axes, float(distance))
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData) -> Float[np.ndarray, "points 3"]:
+    """The corners of boxes around all geoms that are drawn, m; planes have no end."""
+    hidden = (model.geom_group >= _HIDDEN_GROUP) | (model.geom_rgba[:, 3] == 0.0)
+    geoms = np.flatnonzero(~hidden & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value))
+    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), -1).reshape(-1, 3)
+    inside = model.geom_aabb[geoms, None, :3] + signs * model.geom_aabb[geoms, None, 3:]
+    turned = np.einsum("gij,gkj->gki", data.geom_xmat[geoms].reshape(-1, 3, 3), inside)
+    return (data.geom_xpos[geoms, None] + turned).reshape(-1, 3)
+
+
+def _scene(model: mujoco.MjModel, panel: _Panel, distance: float) -> mujoco.MjvScene:
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = centre
-    camera.distance = 1.05 * radius / np.sin(np.radians(0.5 * model.vis.global_.fovy))
-    camera.azimuth, camera.elevation = _view(tips - tails)
-    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + len(drawn) + 100)
-    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+    camera.lookat[:] = panel.centre
+    camera.distance = distance
+    camera.azimuth, camera.elevation = panel.view
+    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + len(panel.numbers) + 100)
+    kinds = mujoco.mjtCatBit.mjCAT_ALL.value
+    mujoco.mjv_updateScene(model, panel.data, mujoco.MjvOption(), None, camera, kinds, scene)
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         scene.flags[flag] = 0
     add_background(scene)
-    for number, tail, tip in zip(drawn.tolist(), tails, tips, strict=True):
-        colour = to_rgba(CONTACT_COLOURS[number % len(CONTACT_COLOURS)])
-        add_arrow(scene, tail, tip, 0.02 * radius, colour)
+    for number, tail, tip in zip(panel.numbers, panel.tails, panel.tips, strict=True):
+        add_arrow(scene, tail, tip, _ARROW_WIDTH, to_rgba(CONTACT_COLOURS[number % len(CONTACT_COLOURS)]))
     return scene
 
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from jaxgrasp.viewer.grasp import draw_grasp
+from jaxgrasp.viewer.grasp import common_scale, draw_grasp
 
 if TYPE_CHECKING:
     from jaxgrasp.synthesis import Synthesis
@@ -43,19 +43,21 @@ def figure_of_synthesis(
     _draw_distribution(histogram, found, unit)
     shown = min(grasps, len(found.margin))
     columns = min(shown, 2)
+    scale = common_scale(found.positions[:shown], found.forces[:shown])
     for number in range(shown):
         panel = right.add_subplot(-(-shown // columns), columns, number + 1, projection="3d", proj_type="ortho")
-        scale = draw_grasp(
+        draw_grasp(
             panel,
             found.positions[number],
             found.outward_normals[number],
             found.forces[number],
             friction=np.full(found.positions.shape[1], friction),
             surface=surface,
+            scale=scale,
         )
-        arrows = f"; arrows: 1 mm = {scale:.2g} N" if np.isfinite(scale) else ""
-        title = f"{name} #{number + 1}: $\\lambda = {found.margin[number]:.3g}$ {unit}{arrows}"
-        panel.set_title(title, fontsize=9, y=1.02)
+        panel.set_title(f"{name} #{number + 1}: $\\lambda = {found.margin[number]:.3g}$ {unit}", fontsize=9, y=1.02)
+    if np.isfinite(scale):
+        right.supxlabel(f"arrows: forces of the fingers on the object, 1 mm = {scale:.2g} N", fontsize=8)
     for axes in (ascent, histogram):
         axes.spines[["top", "right"]].set_visible(False)
     return figure

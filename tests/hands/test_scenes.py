@@ -205,6 +205,20 @@ def test_a_picture_is_written(held, graphics, tmp_path, count, columns, rows):
     assert np.array_equal(model.geom_rgba, before)
 
 
+def test_a_hand_is_whole_in_its_picture(graphics, tmp_path):
+    """Nothing touches the left and right edges, and the hand, without its arm, fills half of the width."""
+    model = shadow_hand("capsule").compile()
+    points = np.zeros((1, 1, 3))
+    for turn in (0.0, 1.0):
+        configuration = model.qpos0[None].copy()
+        joint = model.joint("rh_WRJ1")
+        configuration[0, joint.qposadr[0]] = turn * joint.range[1]
+        draw_scenes(tmp_path / "hand.png", model, configuration, points, np.zeros((1, 1, 3)), [""])
+        seen = (matplotlib.image.imread(tmp_path / "hand.png")[..., :3] < 0.97).any((0, 2))
+        assert not seen[:4].any() and not seen[-4:].any()
+        assert seen.mean() > 0.5
+
+
 def test_a_picture_without_forces(graphics, tmp_path):
     model = shadow_hand("mesh").compile()
     nothing = np.full((1, 5, 3), np.nan)
@@ -232,9 +246,10 @@ def test_an_arrow_ends_where_the_contact_is(graphics, tmp_path):
     red, _, blue = (picture[..., i] for i in range(3))
     object_pixels, arrow = np.argwhere(red - blue > 0.3), np.argwhere(blue - red > 0.2)
     distances = np.linalg.norm(arrow - object_pixels.mean(0), axis=-1)
-    # 40 mm of arrow that end 3 mm from the centre, in a panel in which a millimetre is about seven pixels.
-    assert distances.min() < 28.0
-    assert 295.0 < distances.max() < 325.0
+    # 40 mm of arrow that end 3 mm from the centre of a ball that is 6 mm wide.
+    millimetre = np.ptp(object_pixels, axis=0).max() / 6
+    assert distances.min() < 4 * millimetre
+    assert 41 * millimetre < distances.max() < 46 * millimetre
 
 
 def test_wrong_shapes_are_refused(held, tmp_path):

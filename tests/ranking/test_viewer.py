@@ -1,9 +1,12 @@
 """Figures: that they can be made of any ranking, and that what they draw stands where the numbers say."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from mpl_toolkits.mplot3d.art3d import Line3D
 
 from jaxgrasp.candidates import Candidates, sample_grasps
@@ -68,7 +71,21 @@ def test_the_ending_says_the_format(ending, tmp_path):
 
 def test_labels_have_units():
     text = text_of(figure_of_ranking(ranking_of([3.0, 1.0]), unit="N"))
-    assert "[N]" in text and "1 mm" in text
+    assert "[N]" in text and "\\lambda = 3$ N" in text
+
+
+def test_all_panels_have_one_scale_of_arrows():
+    ranking = ranking_of([3.0, 2.0, 1.0])
+    ranking.object_forces[1] *= 0.1
+    figure = figure_of_ranking(ranking)
+    told = [text.get_text() for legend in figure.findobj(Legend) for text in legend.get_texts() if "1 mm" in str(text)]
+    (scale,) = re.findall(r"1 mm = ([\d.]+) N", told[0])
+    for place, axes in enumerate(figure.findobj(lambda artist: hasattr(artist, "get_zlim"))):
+        thick = [line for line in axes.lines if isinstance(line, Line3D) and line.get_linewidth() == 2.0]
+        places = 1e3 * ranking.candidates.positions[ranking.order[place]]
+        tails = [np.array([coordinate[0] for coordinate in line.get_data_3d()]) for line in thick]
+        lengths = np.linalg.norm(tails - places, axis=-1)
+        np.testing.assert_allclose(lengths, (0.2 if place == 1 else 2.0) / float(scale), rtol=1e-6)
 
 
 def test_a_force_ends_at_its_contact_and_has_the_scale():

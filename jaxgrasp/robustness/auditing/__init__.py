@@ -18,7 +18,7 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.lanes.fence import fences
 from jaxgrasp.robustness.auditing import setting
 from jaxgrasp.robustness.auditing.parts import once
-from jaxgrasp.robustness.auditing.problem import every
+from jaxgrasp.robustness.auditing.problem import devices_of, every
 from jaxgrasp.robustness.auditing.setting import audit
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs, Options, lay_out
 
@@ -114,18 +114,20 @@ def _spotted(kernel: Any, stride: int, arguments: Arguments, out: Tree, verdicts
     lanes = jax.tree.leaves(out)[0].shape[0]
     # Where it is known only when an exported program runs how many there are, all are looked at.
     step = stride if isinstance(lanes, int) and lanes > _SMALL else 1
+    devices = devices_of(jax.tree.leaves(out)[0]) if step > 1 else 1
 
     @once
     def pick(inputs: Inputs, out: Tree, turn: jax.Array) -> tuple[Inputs, Tree]:
-        one = lambda x, shared: x if shared else every(x, turn, step)
-        return jax.tree.map(one, inputs, arguments.shared), jax.tree.map(lambda x: every(x, turn, step), out)
+        picked = partial(every, turn=turn, stride=step, devices=devices) if step > 1 else lambda x: x
+        one = lambda x, shared: x if shared else picked(x)
+        return jax.tree.map(one, inputs, arguments.shared), jax.tree.map(picked, out)
 
     @once
     def spot(inputs: Inputs, out: Tree) -> Tree:
         return kernel.spot(replace(arguments, inputs=inputs), out)
 
     spots = spot(*pick(arguments.inputs, out, turn % step))
-    refuted = partial(_refuted, turn=turn % step, step=step)
+    refuted = partial(_refuted, turn=turn % step, step=step, devices=devices)
     return jax.tree.map(refuted, verdicts, spots, is_leaf=lambda x: hasattr(x, "failed"))
 
 
@@ -139,10 +141,16 @@ def _corrected(kernel: Any, out: Tree, verdicts: Tree) -> Tree:
     return kernel.correct(out, verdicts)
 
 
-def _refuted(verdict: Any, spots: jax.Array, turn: jax.Array, step: int) -> Any:
-    """A verdict with what was found on lane `turn` of every `step`; nothing is confirmed there."""
-    blocks = spots[:, None] & (jnp.arange(step, dtype=turn.dtype) == turn)
-    wrong = jnp.zeros_like(verdict.failed).at[: blocks.size].set(blocks.reshape(-1))
+def _refuted(verdict: Any, spots: jax.Array, turn: jax.Array, step: int, devices: int) -> Any:
+    """A verdict with what was found on lane `turn` of every `step` of each device; nothing is confirmed there."""
+    if step == 1:
+        wrong = spots
+    else:
+        blocks = spots.reshape(devices, -1, 1) & (jnp.arange(step, dtype=turn.dtype) == turn)
+        lanes = blocks.reshape(devices, -1)
+        # Padded within each device: an axis that is divided cannot be.
+        left = len(verdict.failed) // devices - lanes.shape[1]
+        wrong = jnp.pad(lanes, ((0, 0), (0, left))).reshape(-1)
     unknown = {name: hidden(getattr(verdict, name), wrong, jnp.nan) for name in verdict._fields if name != "failed"}
     return verdict._replace(failed=verdict.failed | wrong, **unknown)
 

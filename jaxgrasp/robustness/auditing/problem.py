@@ -1,5 +1,6 @@
 """The data of the grasps as the audit sees them: the public arguments, lanes leading, in newtons and metres."""
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -136,10 +137,19 @@ def _hand(actuation: Actuation, jacobian: jax.Array, friction: jax.Array, max_fo
     )
 
 
-def every(x: jax.Array, turn: jax.Array, stride: int) -> jax.Array:
-    """Lane `turn` of every `stride` lanes; what is left over at the end is not looked at."""
-    blocks = x[: x.shape[0] // stride * stride].reshape(-1, stride, *x.shape[1:])
-    return jax.lax.dynamic_index_in_dim(blocks, turn, 1, keepdims=False)
+def every(x: jax.Array, turn: jax.Array, stride: int, devices: int = 1) -> jax.Array:
+    """Lane `turn` of every `stride` lanes; what is left over at the end, of each device, is not looked at."""
+    lanes = x.reshape(devices, -1, *x.shape[1:])
+    blocks = lanes[:, : lanes.shape[1] // stride * stride].reshape(devices, -1, stride, *x.shape[1:])
+    return jax.lax.dynamic_index_in_dim(blocks, turn, 2, keepdims=False).reshape(-1, *x.shape[1:])
+
+
+def devices_of(lanes: jax.Array) -> int:
+    """Over how many devices the leading axis is divided, as far as its type says so."""
+    sharding = jax.typeof(lanes).sharding
+    axes = sharding.spec[0] if len(sharding.spec) else None
+    names = axes if isinstance(axes, tuple) else (axes,) if axes is not None else ()
+    return math.prod(sharding.mesh.shape[name] for name in names)
 
 
 def facets(problem: Problem, cone_edges: int) -> np.ndarray:
