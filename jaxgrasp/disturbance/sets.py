@@ -114,6 +114,16 @@ class DisturbanceSet:
         return DisturbanceSet(terms=tuple(term.rotated(turn) for term in self.terms))
 
     @own_settings()
+    def scaled(self, factor: ArrayLike) -> "DisturbanceSet":
+        """The same set, larger or smaller.
+
+        Args:
+            factor: (*batch,), >= 0.
+        """
+        given = as_float("factor", factor, ())
+        return DisturbanceSet(terms=tuple(term.scaled(given) for term in self.terms))
+
+    @own_settings()
     def smoothed(self, width: ArrayLike) -> "DisturbanceSet":
         """The same set with a smooth worst case, for optimisers that stumble over the edges of S_1 and S_2.
 

@@ -43,6 +43,10 @@ class Term(Protocol):
         """The set turned by rotations (*batch, 3, 3), for batch-first leaves."""
         ...
 
+    def scaled(self, factor: jax.Array) -> "Term":
+        """The set with all wrenches times factors (*batch,), for batch-first leaves."""
+        ...
+
     def support(self, directions: jax.Array) -> jax.Array:
         """max(0, max over the set of a'w) for directions a (6, ..., *lanes)."""
         ...
@@ -119,6 +123,10 @@ class Box:
         """Turn the axes."""
         return replace(self, axes=rotation if self.axes is None else rotation @ self.axes)
 
+    def scaled(self, factor: jax.Array) -> "Box":
+        """Scale the half extents."""
+        return replace(self, half_extents=factor[..., None] * self.half_extents)
+
     def support(self, directions: jax.Array) -> jax.Array:
         """Sum of |a_i| r_i, a in the box's frame."""
         turned = self._turned(directions)
@@ -191,6 +199,10 @@ class Ellipsoid:
         turned = jnp.einsum("...ij,...hjk->...hik", rotation, halves)
         return replace(self, shape_matrix=turned.reshape(*turned.shape[:-3], 6, 6))
 
+    def scaled(self, factor: jax.Array) -> "Ellipsoid":
+        """Scale L."""
+        return replace(self, shape_matrix=factor[..., None, None] * self.shape_matrix)
+
     def support(self, directions: jax.Array) -> jax.Array:
         """|L'a|."""
         return _length(self._pulled(directions), self.width)
@@ -231,6 +243,10 @@ class Ball:
     def rotated(self, rotation: jax.Array) -> "Ball":
         """A ball stays what it is, but for what is no rotation."""
         return replace(self, force=self.force + 0 * rotation[..., 0, 0])
+
+    def scaled(self, factor: jax.Array) -> "Ball":
+        """Scale both radii."""
+        return replace(self, force=factor * self.force, torque=factor * self.torque)
 
     def support(self, directions: jax.Array) -> jax.Array:
         """Force |a_f| + torque |a_m|."""

@@ -43,6 +43,10 @@ class Vertices:
         turned = jnp.einsum("...ij,...dhj->...dhi", rotation, halves)
         return replace(self, wrenches=turned.reshape(*turned.shape[:-2], 6))
 
+    def scaled(self, factor: jax.Array) -> "Vertices":
+        """Scale the wrenches."""
+        return replace(self, wrenches=factor[..., None, None] * self.wrenches)
+
     def support(self, directions: jax.Array) -> jax.Array:
         """A running maximum over the vertices, a few at a time: memory does not grow with their number."""
         if directions.ndim > self.wrenches.ndim:
