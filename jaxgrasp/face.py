@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from jaxgrasp import metrics, solvers
+from jaxgrasp import metrics, solvers, uncertainty
 from jaxgrasp.contact import Actuation, Compliance, Contacts, grasp_map, required_wrench
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.explanation import Explanation, explain
@@ -26,6 +26,7 @@ from jaxgrasp.robustness import (
     worst_case,
 )
 from jaxgrasp.solvers.status import Status
+from jaxgrasp.uncertainty import MarginDistribution, Uncertainty, margin_distribution
 
 if TYPE_CHECKING:
     from jaxgrasp.evaluation import evaluate
@@ -42,10 +43,12 @@ __all__ = [
     "DisturbanceSet",
     "Explanation",
     "FormulationSolution",
+    "MarginDistribution",
     "Solution",
     "SpecifiedDisturbances",
     "Status",
     "TotalEffortSolution",
+    "Uncertainty",
     "audit",
     "blocking_forces",
     "compare_formulations",
@@ -56,11 +59,13 @@ __all__ = [
     "largest_disturbance",
     "least_effort",
     "least_total_effort",
+    "margin_distribution",
     "metrics",
     "required_wrench",
     "solvers",
     "specified_disturbances",
     "squeeze_grasps",
+    "uncertainty",
     "weighted_pseudo_inverse",
     "without_kernels",
     "worst_case",

@@ -25,6 +25,7 @@ FLOORS = {
     "solvers": 3,
     "robustness": 4,
     "metrics": 5,
+    "uncertainty": 5,
     "hands": 5,
     "candidates": 5,
     "files": 6,
