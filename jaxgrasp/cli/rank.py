@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from jaxgrasp.cli.rank_in_parts import GivenFiles, as_begun, rank_in_parts
 from jaxgrasp.cli.rank_options import RankOptions
 from jaxgrasp.cli.setting import FIGURE_ENDINGS, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import notice, printing
+from jaxgrasp.cli.uncertain import uncertain_columns, uncertain_of
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -60,10 +61,11 @@ class Rank(RankOptions):
         skipped = Skipped()
         try:
             disturbances, unit = named_disturbances(self.disturbances)
+            uncertain = uncertain_of(self)
             if self.of_hand.given:
                 candidates, hands = self.of_hand.candidates(self.friction, self.max_force, skipped)
             elif self.files:
-                given = GivenFiles.of(self, disturbances, names, skipped)
+                given = GivenFiles.of(self, disturbances, names, uncertain, skipped)
                 folder = given.folder(self)
                 if folder is not None:
                     return rank_in_parts(self, folder, given, unit, clock)
@@ -75,7 +77,9 @@ class Rank(RankOptions):
         if not self.of_hand.given:
             warn_of_conventions(candidates)
         clock.lap()
-        metrics = scores_of(candidates, names, disturbances, gravity=self.gravity, cone_edges=self.cone_edges)
+        task: dict[str, Any] = {"gravity": self.gravity, "cone_edges": self.cone_edges}
+        metrics = uncertain_columns(candidates, uncertain, disturbances, **task)
+        metrics |= scores_of(candidates, names, disturbances, **task)
         clock.lap("metrics" if metrics else "")
         self._rank(candidates, disturbances, unit, hands, metrics, clock)
         return skipped.exit_code()
@@ -102,6 +106,7 @@ class Rank(RankOptions):
         inputs = [
             *map(Path, self.files),
             Path(self.disturbances),
+            Path(self.uncertainty or ""),
             Path(self.of_hand.name),
             self.of_hand.qpos or Path(),
             *self.of_hand.grasps,

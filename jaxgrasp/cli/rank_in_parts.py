@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
     from jaxgrasp.cli.report import Clock
     from jaxgrasp.disturbance import DisturbanceSet
+    from jaxgrasp.ranking import Uncertain
     from jaxgrasp.ranking.streams.folder import Manifest
     from jaxgrasp.ranking.streams.run import Job
     from jaxgrasp.ranking.streams.scored import Setting, Summary
@@ -30,6 +31,7 @@ MOST_IN_A_TABLE = 2_000_000
 """The most candidates in one table; of more the result is a folder."""
 # Options that a run has from its beginning on.
 _OPTIONS = ("friction", "max_force", "gravity", "disturbances", "cone_edges", "share", "top", "prune", "metric")
+_OF_UNCERTAINTY = ("uncertainty", "by", "load", "quantile", "draws")
 # The part that is read, that which is solved and that which is written are in memory at once, and copies of each.
 _SHARES = 8
 _TOLD = 3
@@ -53,7 +55,12 @@ class GivenFiles:
 
     @classmethod
     def of(
-        cls, command: RankOptions, disturbances: "DisturbanceSet", names: Sequence[str], skipped: Skipped
+        cls,
+        command: RankOptions,
+        disturbances: "DisturbanceSet",
+        names: Sequence[str],
+        uncertain: "Uncertain | None",
+        skipped: Skipped,
     ) -> "GivenFiles":
         """Looks at the files of a command.
 
@@ -65,7 +72,7 @@ class GivenFiles:
         from jaxgrasp.ranking.streams.scored import Setting
 
         own = {name: getattr(command, name) for name in _OPTIONS if name not in ("disturbances", "metric")}
-        setting = Setting(disturbances=disturbances, metrics=tuple(names), **own)
+        setting = Setting(disturbances=disturbances, metrics=tuple(names), uncertain=uncertain, **own)
         going = command.of_hand.keep_going
         files = names_of(command.files)
         with counting_bar("looking at files", len(files)) as progress:
@@ -140,7 +147,7 @@ def as_begun(command: R) -> R:
     plain = {field.name: field.default for field in fields(command)}
     own = {
         name: manifest.options[name]
-        for name in _OPTIONS
+        for name in _OPTIONS + _OF_UNCERTAINTY
         if name in manifest.options and getattr(command, name) == plain[name]
     }
     if "metric" in own:
@@ -162,6 +169,9 @@ def _options(command: RankOptions) -> dict[str, Any]:
     options |= {"metric": metric_names(command.metric), "part_size": command.in_parts.part_size}
     if Path(command.disturbances).is_file():
         options |= {"disturbances": absolute(command.disturbances), "wrenches": digest_of(command.disturbances)}
+    if command.uncertainty is not None:
+        options |= {name: getattr(command, name) for name in _OF_UNCERTAINTY}
+        options |= {"uncertainty": absolute(command.uncertainty), "distributions": digest_of(command.uncertainty)}
     return options
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -117,6 +117,23 @@ class RankOptions(Reading):
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Other metrics to have in the table, NAME[,NAME...]; the first one ranks. A wrong name is answered with all
     names."""
+
+    uncertainty: str | None = None
+    """A FILE, .json or .npz, of how friction, contacts, masses and loads are distributed: docs/uncertainty.md. It adds
+    columns, and --by says which of them ranks."""
+
+    by: Literal["p_hold", "quantile", "tail_mean"] = "p_hold"
+    """With --uncertainty, what ranks: p_hold, the probability that the margin is at least --load; the --quantile of the
+    margin; or tail_mean, the mean margin of the worst --quantile of the draws."""
+
+    load: float = 1.0
+    """With --uncertainty, the margin that p_hold asks for."""
+
+    quantile: float = 0.1
+    """With --uncertainty, the level of the column margin_quantile, and the share of draws behind margin_tail_mean."""
+
+    draws: int | None = None
+    """With --uncertainty, how many draws a grasp gets; None is 1,000, or as many as the file gives."""
 
     output: Path | None = OUTPUT
     """The table to write, .parquet, .csv or .npz; None for no table."""

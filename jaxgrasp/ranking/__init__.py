@@ -5,6 +5,7 @@ from jaxgrasp.ranking.rank import Ranking, RankingInterrupted, rank
 from jaxgrasp.ranking.scores import check_metrics, score
 from jaxgrasp.ranking.streams import TableRanker, rank_batches, rank_dataset
 from jaxgrasp.ranking.table import TABLE_ENDINGS, ranking_table, write_table
+from jaxgrasp.ranking.uncertain import Uncertain, uncertain_scores
 
 __all__ = [
     "TABLE_ENDINGS",
@@ -13,6 +14,7 @@ __all__ = [
     "Ranking",
     "RankingInterrupted",
     "TableRanker",
+    "Uncertain",
     "check_metrics",
     "compare_metrics",
     "rank",
@@ -20,5 +22,6 @@ __all__ = [
     "rank_dataset",
     "ranking_table",
     "score",
+    "uncertain_scores",
     "write_table",
 ]

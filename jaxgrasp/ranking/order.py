@@ -6,9 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxgrasp.metrics import METRICS
+from jaxgrasp.ranking.uncertain import COLUMNS, P_HOLD, QUANTILE
 from jaxgrasp.solvers.status import Status
 
 _ANSWERED = (Status.SOLVED, Status.UNBOUNDED)
+_TIE = 1e-9
 _LAST = {Status.INFEASIBLE: 2, Status.INVALID_INPUT: 3, Status.NOT_VERIFIED: 4}
 
 
@@ -32,13 +34,18 @@ def order_keys(
     Args:
         margin: lambda of (21).
         status: `Status` of (21).
-        metrics: Where there are any, the first ranks in place of the margin.
+        metrics: Where there are any, the first ranks in place of the margin; equal probabilities to hold are ordered
+            by the quantile of the margin.
 
     Returns:
         The group, and what ranks inside it; equals are to be ordered by file and row.
     """
     for name, value in metrics.items():
-        found = value if METRICS[name].larger_is_better else -value
+        larger_is_better = name in COLUMNS or METRICS[name].larger_is_better
+        found = value if larger_is_better else -value
+        if name == P_HOLD:
+            # Many hold in all draws: they are told apart by the quantile. Probabilities differ by far more.
+            found = found + _TIE * np.arctan(metrics[QUANTILE])
         return np.isnan(found).astype(int), np.where(np.isnan(found), 0.0, -found)
     group = np.ones(len(margin), dtype=int)
     group[certain(margin, status)] = 0

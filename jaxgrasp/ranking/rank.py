@@ -12,6 +12,7 @@ from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.ranking.order import certain, least_of_best, order_of
 from jaxgrasp.ranking.scores import check_metrics
 from jaxgrasp.ranking.tiles import Columns, columns_of, margins, solve_in_tiles, tightening
+from jaxgrasp.ranking.uncertain import COLUMNS
 from jaxgrasp.solvers.status import Status
 
 
@@ -107,7 +108,8 @@ def rank(
         top: How many of the best get tightening forces.
         prune: Whether candidates that cannot be among the `top` are given up as soon as their bounds tell, with status
             PRUNED; the `top` themselves are the same. Not together with `metrics`.
-        metrics: Of all candidates, from `score`; where there are any, the first ranks in place of the margin.
+        metrics: Of all candidates, from `score` or `uncertain_scores`; where there are any, the first ranks in place of
+            the margin.
         tile: Candidates at a time, at most; None chooses by platform.
         progress: Called after each tile of (21), and then of (22), with the number of candidates done by (21).
 
@@ -128,7 +130,7 @@ def rank(
         raise ValueError(f"top: got {top}; wanted a number that is not negative")
     if disturbances is None:
         disturbances = DisturbanceSet.forces(1.0)
-    check_metrics(list(metrics or {}))
+    check_metrics([name for name in metrics or {} if name not in COLUMNS])
     if prune and metrics:
         raise ValueError("prune: got metrics, too; wanted a ranking by the margin alone")
     scores = _Scores.none(len(candidates), dict(metrics or {}))

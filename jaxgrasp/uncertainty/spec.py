@@ -132,7 +132,7 @@ class Uncertainty:
         """The distributions by the names of quantities; a number is the standard deviation of a normal distribution.
 
         Raises:
-            ValueError: a name is unknown, or a distribution cannot be one of its quantity; samples differ in number.
+            ValueError: there is none, a name is unknown, or a distribution cannot be one of its quantity; samples differ in number.
 
         Example:
             >>> jg.Uncertainty.of(friction=0.1, position=0.002, normal=np.radians(10), center_of_mass=0.005)
@@ -144,6 +144,8 @@ class Uncertainty:
             if given is not None:
                 found[name] = given if isinstance(given, Distribution | Samples) else normal(given)
                 _check_quantity(name, found[name])
+        if not found:
+            raise ValueError(f"uncertainty: got nothing, wanted at least one of {', '.join(QUANTITIES)}")
         uncertainty = cls(**found)
         uncertainty.sample_count()
         return uncertainty

@@ -7,19 +7,21 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxgrasp.ranking import Ranking
 from jaxgrasp.ranking.sketch import NOTHING, Sketch
+from jaxgrasp.ranking.uncertain import P_HOLD
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.storage import atomic_write
 from jaxgrasp.viewer.grasp import CONTACT_COLOURS, common_scale, draw_grasp
 from jaxgrasp.viewer.held import Held
 
 _SURFACE_POINTS = 1500
+_DOTS = 5000
 
 
 def figure_of_ranking(
@@ -32,6 +34,8 @@ def figure_of_ranking(
     sketch: Sketch | None = None,
 ) -> Figure:
     """Draws the distribution of the margins and the best grasps with their tightening forces.
+
+    With an uncertainty there is a panel of the probability to hold over the margin.
 
     Where the candidates have a column `object_name`, the contacts of all candidates on the same object are drawn as
     dots that hint at its surface.
@@ -51,10 +55,10 @@ def figure_of_ranking(
     shown = np.flatnonzero(np.isfinite(ranking.effort))[:grasps].tolist()
     figure = Figure(figsize=(13.0, 7.6) if shown else (5.0, 6.0), layout=ConstrainedLayoutEngine(hspace=0.06), dpi=150)
     if not shown:
-        _draw_distribution(figure.subplots(2, 1, height_ratios=(3, 1)), ranking, unit, sketch)
+        _draw_left(figure, ranking, unit, sketch)
         return figure
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.9), squeeze=False).flat
-    _draw_distribution(left.subplots(2, 1, height_ratios=(3, 1)), ranking, unit, sketch)
+    _draw_left(left, ranking, unit, sketch)
     columns = min(len(shown), 2)
     present = [ranking.candidates.active[row] for row in ranking.order[shown]]
     scale = common_scale(
@@ -83,6 +87,28 @@ def write_figure(figure: Figure, path: Path | str) -> None:
     path = Path(path)
     with atomic_write(path) as stream:
         figure.savefig(stream, format=path.suffix.removeprefix("."))
+
+
+def _draw_left(figure: FigureBase, ranking: Ranking, unit: str, sketch: Sketch | None) -> None:
+    if P_HOLD not in ranking.metrics:
+        _draw_distribution(figure.subplots(2, 1, height_ratios=(3, 1)), ranking, unit, sketch)
+        return
+    histogram, certainty, counts = figure.subplots(3, 1, height_ratios=(3, 2, 1))
+    _draw_distribution(np.array([histogram, counts]), ranking, unit, sketch)
+    _draw_certainty(certainty, ranking, unit)
+
+
+def _draw_certainty(axes: Axes, ranking: Ranking, unit: str) -> None:
+    """Draws how probably candidates hold over their margins."""
+    known = np.flatnonzero(np.isfinite(ranking.margin) & np.isfinite(ranking.metrics[P_HOLD]))
+    # Of so many dots more tell nothing.
+    some = known[:: max(1, len(known) // _DOTS)]
+    best = np.intersect1d(ranking.order[: len(ranking.forces)], known)
+    for rows, colour, size in ((some, "#4477aa", 4), (best, "#cc3311", 14)):
+        axes.scatter(ranking.margin[rows], ranking.metrics[P_HOLD][rows], s=size, color=colour, linewidths=0)
+    axes.set(xlabel=f"robustness margin $\\lambda$ [{unit}]", ylabel="P(hold)", ylim=(-0.05, 1.05))
+    axes.set_title("How probably candidates hold", fontsize=10)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _draw_distribution(axes: np.ndarray, ranking: Ranking, unit: str, sketch: Sketch | None) -> None:

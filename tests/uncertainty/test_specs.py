@@ -21,6 +21,7 @@ PUSHES = jg.DisturbanceSet.forces(1.0)
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: jg.Uncertainty.of(), "nothing"),
         (lambda: jg.Uncertainty.of(frictoin=0.1), "'frictoin'"),
         (lambda: jg.Uncertainty.of(friction=-0.1), "std"),
         (lambda: jg.Uncertainty.of(normal=10.0), "radians"),

@@ -98,7 +98,7 @@ class Job:
             Its rows, and its summary.
         """
         if read.batch is None:
-            part = nothing(self.sources[0].framed, self.schema, self.setting.metrics)
+            part = nothing(self.sources[0].framed, self.schema, self.setting.columns)
         else:
             part = scored(*read.batch, self.setting, best=best, progress=progress)
         table = part_table(part, any(source.massive for source in self.sources))
@@ -148,7 +148,7 @@ def run_job(
         OSError: A part cannot be written; those before it are there.
     """
     report, tell = progress or (lambda _: None), skipped or (lambda _: None)
-    done, found = 0, Summary.of(nothing(job.sources[0].framed, job.schema, job.setting.metrics), job.setting.top)
+    done, found = 0, Summary.of(nothing(job.sources[0].framed, job.schema, job.setting.columns), job.setting.top)
     with _Steps(job) as steps:
         for number, read in steps.in_order():
             rows = sum(segment.stop - segment.start for segment in job.plan[number])

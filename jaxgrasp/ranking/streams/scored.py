@@ -17,6 +17,7 @@ from jaxgrasp.ranking.scores import score
 from jaxgrasp.ranking.sketch import Sketch
 from jaxgrasp.ranking.streams.sources import Given
 from jaxgrasp.ranking.tiles import columns_of, margins, solve_in_tiles
+from jaxgrasp.ranking.uncertain import Uncertain, uncertain_scores
 from jaxgrasp.solvers.status import Status
 
 _SCORE, _METRIC, _INPUT, _SOURCE = "score:", "metric:", "input:", "source"
@@ -40,10 +41,17 @@ class Setting:
     """Whether candidates that cannot be among the best are given up."""
     metrics: tuple[str, ...] = ()
     """Names of other metrics, that which ranks first."""
+    uncertain: Uncertain | None = None
+    """What is not known of the candidates; it ranks before other metrics."""
     friction: float | None = None
     """Coulomb's coefficient where the input has none."""
     max_force: float | None = None
     """Largest normal force where the input has none, N."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The names of everything that is found beside the margin, that which ranks first."""
+        return (*(self.uncertain.names if self.uncertain else ()), *self.metrics)
 
     @property
     def given(self) -> Given:
@@ -114,7 +122,9 @@ def scored(
     """
     count, columns = len(candidates), columns_of(candidates)
     settings: dict[str, Any] = {"gravity": setting.gravity, "cone_edges": setting.cone_edges}
-    metrics = {name: score(candidates, name, setting.disturbances, stream=True, **settings) for name in setting.metrics}
+    own = {"disturbances": setting.disturbances, "stream": True, **settings}
+    metrics = uncertain_scores(candidates, setting.uncertain, **own) if setting.uncertain else {}
+    metrics |= {name: score(candidates, name, **own) for name in setting.metrics}
     margin, upper_bound, status = np.empty(count), np.empty(count), np.empty(count, dtype=int)
     best = np.empty(0) if best is None else best
     if setting.prune:

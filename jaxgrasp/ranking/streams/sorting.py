@@ -112,7 +112,7 @@ def _keys(job: Job, table: pa.Table) -> np.ndarray:
     found = table.column("status").combine_chunks()
     numbers = np.array([_NUMBERS[name] for name in found.dictionary.to_pylist()], dtype=int)
     status = numbers[found.indices.to_numpy()]
-    metrics = {name: table.column(name).to_numpy() for name in job.setting.metrics[:1]}
+    metrics = {name: table.column(name).to_numpy() for name in job.setting.columns[:2]}
     keys = np.empty(table.num_rows, dtype=complex)
     keys.real, keys.imag = order_keys(table.column("margin").to_numpy(), status, metrics)
     return keys
