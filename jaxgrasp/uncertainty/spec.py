@@ -5,6 +5,7 @@ what tells grasps apart is not their luck.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import field, fields
 from typing import Any, NamedTuple
 
@@ -21,6 +22,9 @@ from jaxgrasp.records import record
 
 # A correlation matrix is symmetric with ones on its diagonal, and has no eigenvalue below zero, but for rounding.
 _ROUNDING = 1e-6
+
+Numbers = ArrayLike | Sequence[Any]
+"""A number, an array, or nested lists."""
 
 
 class Quantity(NamedTuple):
@@ -128,11 +132,12 @@ class Uncertainty:
     """The required wrench."""
 
     @classmethod
-    def of(cls, **quantities: "Distribution | Samples | ArrayLike | None") -> "Uncertainty":
+    def of(cls, **quantities: "Distribution | Samples | Numbers | None") -> "Uncertainty":
         """The distributions by the names of quantities; a number is the standard deviation of a normal distribution.
 
         Raises:
-            ValueError: there is none, a name is unknown, or a distribution cannot be one of its quantity; samples differ in number.
+            ValueError: there is none, a name is unknown, a distribution cannot be one of its quantity, or samples
+                differ in number.
 
         Example:
             >>> jg.Uncertainty.of(friction=0.1, position=0.002, normal=np.radians(10), center_of_mass=0.005)
@@ -169,11 +174,11 @@ class Uncertainty:
 
 
 def normal(
-    std: ArrayLike,
-    mean: ArrayLike = 0.0,
-    lower: ArrayLike | None = None,
-    upper: ArrayLike | None = None,
-    correlation: ArrayLike | None = None,
+    std: Numbers,
+    mean: Numbers = 0.0,
+    lower: Numbers | None = None,
+    upper: Numbers | None = None,
+    correlation: Numbers | None = None,
 ) -> Distribution:
     """A normal distribution of deviations, truncated where bounds are given.
 
@@ -197,7 +202,7 @@ def normal(
     return _distribution("std", std, mean, bounds, correlation, uniform=False)
 
 
-def uniform(half_width: ArrayLike, mean: ArrayLike = 0.0, correlation: ArrayLike | None = None) -> Distribution:
+def uniform(half_width: Numbers, mean: Numbers = 0.0, correlation: Numbers | None = None) -> Distribution:
     """A uniform distribution of deviations between mean - half_width and mean + half_width.
 
     Args:
@@ -211,7 +216,7 @@ def uniform(half_width: ArrayLike, mean: ArrayLike = 0.0, correlation: ArrayLike
     return _distribution("half_width", half_width, mean, None, correlation, uniform=True)
 
 
-def samples(values: ArrayLike) -> Samples:
+def samples(values: Numbers) -> Samples:
     """Deviations that are given, of any joint distribution: sample k of all quantities belongs together.
 
     Args:
@@ -228,7 +233,7 @@ def samples(values: ArrayLike) -> Samples:
 
 
 def _distribution(
-    name: str, spread: ArrayLike, mean: ArrayLike, bounds: Any, correlation: ArrayLike | None, *, uniform: bool
+    name: str, spread: Numbers, mean: Numbers, bounds: Any, correlation: Numbers | None, *, uniform: bool
 ) -> Distribution:
     size, middle = as_float(name, spread, ()), as_float("mean", mean, ())
     _refuse(name, spread, not _known(jnp.isfinite(size) & (size >= 0)), "finite numbers >= 0")
