@@ -65,10 +65,11 @@ def speed() -> str:
     plain()
     (wall, cpu), (all_wall, all_cpu) = _seconds(plain, 5), _seconds(lambda: random(contacts), 1)
     many = GRASPS * SAMPLES / len(flat.positions)
-    return f"""{GRASPS:,} sampled grasps of {contacts.n_c} contacts, {SAMPLES:,} draws each: {all_wall:.1f} s,
-{all_wall / (many * wall):.2f} times what as many margins of such grasps take in batches of {len(flat.positions):,};
-in processor seconds {all_cpu:.1f}, {all_cpu / (many * cpu):.2f} times. The process's peak was {peaks[0]:.0f} MiB after
-{GRASPS // 10:,} grasps and {peaks[1]:.0f} MiB after {GRASPS:,}.
+    by_cpu, by_wall = all_cpu / (many * cpu), all_wall / (many * wall)
+    return f"""{GRASPS:,} sampled grasps of {contacts.n_c} contacts, {SAMPLES:,} draws each, take {by_cpu:.2f} times the
+processor seconds ({all_cpu:.1f}) and {by_wall:.2f} times the time of as many margins of such grasps in
+batches of {len(flat.positions):,}. The process's peak was {peaks[0]:.0f} MiB after {GRASPS // 10:,} grasps and
+{peaks[1]:.0f} MiB after {GRASPS:,}.
 """
 
 

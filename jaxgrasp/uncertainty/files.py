@@ -31,10 +31,8 @@ def read_uncertainty(path: Path | str) -> Uncertainty:
         FileError: The file cannot be read, a name in it is unknown, or what it has is no distribution.
 
     Example:
-        >>> Path("errors.json").write_text('{"friction": 0.1, "normal": {"std": 0.17, "correlation": 0.5}}')
-        42
-        >>> read_uncertainty("errors.json").friction.spread
-        Array(0.1, ...)
+        >>> spec = read_uncertainty("errors.json")  # doctest: +SKIP
+        >>> jg.margin_distribution(grasp, pushes, spec)  # doctest: +SKIP
     """
     path = Path(path)
     given = _of_archive(path) if path.suffix == ".npz" else _of_json(path)
