@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +19,11 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.records import record
 from jaxgrasp.robustness import largest_disturbance
-from jaxgrasp.robustness.interface.arguments import GraspData, Options, Trailing, lay_out, trailing_shapes
+from jaxgrasp.robustness.interface.arguments import GraspData, Options, lay_out
 from jaxgrasp.solvers.status import Status
 from jaxgrasp.uncertainty.draws import Draws, apply, draw, turn_jacobian
 from jaxgrasp.uncertainty.holding import slack_of
+from jaxgrasp.uncertainty.layout import Grasps, divided, lanes_of
 from jaxgrasp.uncertainty.spec import Uncertainty
 from jaxgrasp.uncertainty.statistics import Estimate, mean_of, probability_of, quantile_of, tail_mean_of
 
@@ -182,16 +182,6 @@ class _Question:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class _Grasps:
-    """The arguments of grasps; leaves (lanes, 1, ...), or without these axes where all grasps share them."""
-
-    data: GraspData
-    margin: jax.Array
-    forces: jax.Array | None
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
 class _Solved:
     """What was found of draws, (lanes, samples)."""
 
@@ -216,7 +206,7 @@ def _run(
     dtype = data.contacts.positions.dtype
     draws = draw(uncertainty, data.contacts.n_c, question.count, seed, dtype)
     batch = lay_out(data, options).batch
-    grasps, own = _lanes_of(data, options, forces, batch)
+    grasps, own = lanes_of(data, options, forces, batch)
     leaves, structure = jax.tree.flatten(grasps)
     own = jax.tree.leaves(own)
     # Few grasps at a time, so that their margins can be kept.
@@ -230,57 +220,12 @@ def _run(
         parts = [next(rest) if has_lanes else x for x, has_lanes in zip(leaves, own, strict=True)]
         return _of_some(question, jax.tree.unflatten(structure, parts), draws, thresholds.astype(dtype))
 
-    some = [_divided(x, chunks, size) for x, has_lanes in zip(leaves, own, strict=True) if has_lanes]
+    some = [divided(x, chunks, size) for x, has_lanes in zip(leaves, own, strict=True) if has_lanes]
     found = jax.lax.map(one, some)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count].reshape(*batch, *x.shape[2:]), found)
 
 
-def _divided(x: jax.Array, parts: int, size: int) -> jax.Array:
-    """An array (count, ...) as (parts, size, ...), filled with its last entry, or zeros where there is none."""
-    mode = "edge" if len(x) else "constant"
-    filled = jnp.pad(x, [(0, parts * size - len(x))] + [(0, 0)] * (x.ndim - 1), mode=mode)
-    return filled.reshape(parts, size, *x.shape[1:])
-
-
-def _lanes_of(
-    data: GraspData, options: Options, forces: jax.Array | None, batch: tuple[int, ...]
-) -> tuple[_Grasps, Any]:
-    """Give the arguments axes of lanes and of samples where grasps do not share them; also which these are.
-
-    Raises:
-        ValueError: shapes that do not fit.
-    """
-    axes, dtype = (math.prod(batch), 1), data.contacts.positions.dtype
-    shapes = replace(trailing_shapes(data, options)[0], disturbances=None)
-    others, disturbances = replace(data, disturbances=None), data.disturbances
-    own = jax.tree.map(lambda x, end: end.lead(x) != (), others, shapes)
-    # What belongs to contacts goes with them.
-    own = replace(own, contacts=jax.tree.map(lambda _: True, data.contacts))
-    if data.cone_margin is not None and data.cone_margin.ndim:
-        own = replace(own, cone_margin=True)
-
-    def lay(x: jax.Array, end: Trailing, has_lanes: bool) -> jax.Array:
-        x = x if x.dtype == bool else x.astype(dtype)
-        return jnp.broadcast_to(x, (*batch, *end.shape)).reshape(*axes, *end.shape) if has_lanes else x
-
-    laid = jax.tree.map(lay, others, shapes, own)
-    disturbed = disturbances.batch_shape != ()
-    if disturbed:
-        spread = disturbances.spread_over(batch)
-        disturbances = jax.tree.map(lambda x: x.reshape(*axes, *x.shape[len(batch) :]), spread)
-    own = replace(own, disturbances=jax.tree.map(lambda _: disturbed, disturbances))
-    if forces is not None:
-        end = Trailing(forces.shape[-2:])
-        try:
-            forces = lay(forces, end, True)
-        except ValueError:
-            raise ValueError(f"forces: got shape {forces.shape}, wanted {(*batch, *end.shape)}") from None
-    margin = lay(jnp.asarray(options.margin), Trailing(()), True)
-    grasps = _Grasps(replace(laid, disturbances=disturbances), margin, forces)
-    return grasps, (own, True, None if forces is None else True)
-
-
-def _of_some(question: _Question, grasps: _Grasps, draws: Draws, thresholds: jax.Array) -> MarginDistribution:
+def _of_some(question: _Question, grasps: Grasps, draws: Draws, thresholds: jax.Array) -> MarginDistribution:
     """The distributions of some grasps (lanes,)."""
     lanes, count = len(grasps.margin), question.count
     # Few samples at a time, so that solving them fits a cache.
@@ -291,7 +236,7 @@ def _of_some(question: _Question, grasps: _Grasps, draws: Draws, thresholds: jax
     def solve(_: None, some: Draws) -> tuple[None, _Solved]:
         return None, _solve(question, grasps, some)
 
-    _, found = jax.lax.scan(solve, None, jax.tree.map(lambda x: _divided(x, steps, size), draws), length=steps)
+    _, found = jax.lax.scan(solve, None, jax.tree.map(lambda x: divided(x, steps, size), draws), length=steps)
     solved = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(lanes, -1)[:, :count], found)
 
     margins, scale = solved.margin, grasps.margin[:, 0]
@@ -322,7 +267,7 @@ def _of_some(question: _Question, grasps: _Grasps, draws: Draws, thresholds: jax
     return jax.tree.map(hide, distribution)
 
 
-def _solve(question: _Question, grasps: _Grasps, draws: Draws) -> _Solved:
+def _solve(question: _Question, grasps: Grasps, draws: Draws) -> _Solved:
     """Solve (21) for grasps (lanes, 1) with draws (samples,)."""
     data = grasps.data
     drawn = apply(data.contacts, data.required_wrench, draws)
@@ -374,7 +319,7 @@ def _status_of(status: jax.Array) -> jax.Array:
 
 
 def _first_order(
-    question: _Question, grasps: _Grasps, draws: Draws, thresholds: jax.Array, mean: Estimate, quantiles: Estimate
+    question: _Question, grasps: Grasps, draws: Draws, thresholds: jax.Array, mean: Estimate, quantiles: Estimate
 ) -> FirstOrder:
     """The estimate from the margins' gradients at the mean of the draws."""
     lanes = len(grasps.margin)
