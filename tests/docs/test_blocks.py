@@ -26,6 +26,7 @@ SLOW = {
     "docs/scenes.md",
     "docs/synthesis.md",
     "docs/tutorial.md",
+    "docs/uncertainty.md",
 }
 # Hundreds of steps from random starts make other grasps of other roundings, which depend on the processor.
 SCATTER = {"docs/hand_synthesis.md": 0.2, "docs/synthesis.md": 0.1, "docs/tutorial.md": 0.2}
@@ -88,4 +89,4 @@ def test_the_comparison_finds_what_differs():
 
 def test_all_blocks_have_a_language():
     for page in PAGES:
-        assert {block.language for block in blocks(page)} <= {"python", "sh", "text"}, page
+        assert {block.language for block in blocks(page)} <= {"python", "sh", "text", "json"}, page

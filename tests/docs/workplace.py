@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import trimesh
+from documented import ROOT, blocks
 
 import jaxgrasp.hands as hands
 from jaxgrasp.candidates import sample_grasps
@@ -41,6 +42,10 @@ def write_candidates(folder: Path) -> None:
     (folder / "old").mkdir()
     for path in ("grasps.npz", "more.npz", "grasps/some.npz", "old/others.npz"):
         np.savez(folder / path, friction=0.6, max_force=5.0, **fields)
+    # The file of the page that tells of such files.
+    (folder / "errors.json").write_text(
+        next(block.code for block in blocks(ROOT / "docs" / "uncertainty.md") if block.language == "json")
+    )
     table = pyarrow.table({name: np.asarray(array).tolist() for name, array in fields.items()})
     table = table.append_column("friction", [np.full(64, 0.6)]).append_column("max_force", [np.full(64, 5.0)])
     for name in ("grasps.parquet", "more.parquet"):
