@@ -149,7 +149,8 @@ def framed(text: str) -> dict[str, tuple[dict[str, list[Access]], dict[str, list
 def unwritten(text: str) -> list[str]:
     """The lines of a module, each with its function, that read what was not written."""
     functions = framed(text)
-    size = int(re.search(r"%frame = alloca \[(\d+)", text)[1])
+    # On the stack or, if it is large, on the heap.
+    size = int(re.search(r"(?:%frame = alloca \[|%bytes = add i64 )(\d+)", text)[1])
     width = int(re.search(r"udiv i64 %almost, (\d+)", text)[1])
     frame, wrong = Frame(functions, size), []
 
