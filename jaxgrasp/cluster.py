@@ -14,13 +14,13 @@ class Cluster:
     ray: Any
     """The module of Ray; what is not installed has no types."""
     workers: int
-    """How many processes are to work."""
+    """The number of processes that work."""
     gpus: bool
-    """Whether each of them has a GPU, and not a processor."""
+    """True if each of them takes a GPU, False if a processor."""
 
     @property
     def each(self) -> dict[str, int]:
-        """What a worker takes of the cluster, as Ray's options."""
+        """Ray's options for the resources of one worker."""
         return {"num_gpus": 1} if self.gpus else {"num_cpus": 1}
 
 
@@ -52,7 +52,7 @@ def joined(address: str, workers: int | None = None) -> Iterator[Cluster]:
 
 @dataclass(frozen=True, kw_only=True)
 class JaxSettings:
-    """How JAX is set in the driver, and shall be in workers."""
+    """Options of JAX in the driver, which workers take over."""
 
     x64: bool
     cache: str | None

@@ -168,7 +168,7 @@ class Evaluate(Published):
 
     @contextlib.contextmanager
     def _where(self) -> "Iterator[Callable[..., Evaluation]]":
-        """What tries grasps: this process, or a cluster.
+        """The function that tries grasps, in this process or on a cluster.
 
         Raises:
             CommandError: There is no such cluster, or it cannot do the work.

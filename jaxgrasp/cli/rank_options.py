@@ -107,8 +107,7 @@ class RankOptions(Reading):
     """How many of the best get tightening forces."""
 
     explain: int = 0
-    """Of how many of the best to tell what ends their margin, which disturbance they stand least, and what would
-    help."""
+    """Tell of this many of the best what ends their margin, which disturbance they stand least, and what would help."""
 
     prune: bool = False
     """Give up grasps that cannot be among the best --top as soon as their bounds tell: the best are the same, sooner;

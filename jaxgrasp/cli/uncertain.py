@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def uncertain_of(command: RankOptions) -> "Uncertain | None":
-    """What is asked about the file of --uncertainty; None without one.
+    """Reads the file of --uncertainty and checks its options; None without one.
 
     Raises:
         CommandError: An option cannot be used.

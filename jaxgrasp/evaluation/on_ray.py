@@ -24,12 +24,12 @@ _ROWS = tuple(f.name for f in fields(Evaluation) if f.name not in ("protocol", "
 
 
 class _Tried(NamedTuple):
-    """What a task found."""
+    """The results of one task."""
 
     columns: dict[str, np.ndarray]
     skipped: list[str]
     failed: ValueError | None
-    """What is wrong with the object, where it is not to be passed over."""
+    """The error of an object that is not to be passed over; None without one."""
 
 
 def evaluate_on_ray(

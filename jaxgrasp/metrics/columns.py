@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
 
 from jaxgrasp.arrays import as_float, broadcast_batch, fold
 from jaxgrasp.contact import Contacts
@@ -77,24 +76,22 @@ def over_grasps(
     program: Callable[..., Tree],
     contacts: Contacts,
     space: WrenchSpace | None,
-    *vectors: Float[Array, "*batch entries"],
 ) -> Tree:
     """Run a program of columns over a batch of grasps; its results are constants to the derivative.
 
     Args:
-        program: a function of a module, of `Columns` and of the vectors, lanes last.
+        program: a function of a module, of `Columns`, lanes last.
         contacts: the grasps.
         space: conventions.
-        vectors: what every grasp has besides.
 
     Returns:
         The results of the program, leaves (*batch, ...).
     """
-    contacts, space, vectors = lax.stop_gradient((contacts, checked(contacts, space), vectors))
+    contacts, space = lax.stop_gradient((contacts, checked(contacts, space)))
     dtype, own = contacts.positions.dtype, len(contacts.batch_shape)
     length = None if space.length is None else as_float("length", space.length, ()).astype(dtype)
     reference = None if space.reference is None else as_float("reference", space.reference, (3,)).astype(dtype)
-    batches = {"contacts": contacts.batch_shape} | {f"vectors {i}": v.shape[:-1] for i, v in enumerate(vectors)}
+    batches = {"contacts": contacts.batch_shape}
     batches |= {} if length is None else {"length": length.shape}
     batches |= {} if reference is None else {"reference": reference.shape[:-1]}
     batch = broadcast_batch(**batches)
@@ -110,11 +107,10 @@ def over_grasps(
             length=None if length is None else lanes(length, 0),
             reference=None if reference is None else lanes(reference, 1),
         ),
-        *[lanes(v, 1) for v in vectors],
     )
     rows = contacts.n_c * (space.cone_edges + 2 * (contacts.components - 3))
     found = map_lanes(
-        (lambda of_grasp: program(columns_of(*of_grasp[:2]), *of_grasp[2:]),),
+        (lambda of_grasp: program(columns_of(*of_grasp)),),
         arguments,
         jax.tree.map(lambda _: False, arguments),
         rows,

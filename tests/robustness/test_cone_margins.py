@@ -390,6 +390,7 @@ def test_slopes_are_those_of_differences(program: str) -> None:
             [chain.ORACLES[program](batch.case(i, EDGES, d[i])) for i in range(len(batch))]
         )
     linear = program in ("21", *PYRAMIDS)
+    # Exact margins are known to some 1e-9, which differences over less would multiply.
     step = 1e-5 if linear else 1e-4
     ends = [
         by_highs(d + sign * step * along) if linear else np.asarray(value(jnp.asarray(d + sign * step * along), False))

@@ -11,7 +11,7 @@ points to. Any z that is moved by U'(U U')^-1 (c - U z) attains c, and its sum i
 negative.
 
 Here the points are balanced: they sum up to zero. Then all may have the same more of z, so both programs have interior
-points to start from, and the bounds are never far. `embedded_gauge` is for other points.
+points to start from, and the bounds are never far.
 
 Callers scale: U has orthonormal rows, or zeros, before the mean is taken from all points.
 
