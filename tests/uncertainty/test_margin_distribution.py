@@ -145,8 +145,9 @@ def test_forces_hold_where_every_row_does():
 def test_parts_of_a_batch_and_of_the_samples_do_not_matter(monkeypatch):
     monkeypatch.setattr(distribution, "_SOLVED", 16)
     monkeypatch.setattr(distribution, "_KEPT", 3 * SAMPLES)
+    forces = pulled()
     ask = lambda contacts: jg.margin_distribution(
-        contacts, PUSHES, SPEC, WEIGHT, samples=SAMPLES, at_least=(0.5, 2.0), forces=pulled(), margin=0.4, seed=5
+        contacts, PUSHES, SPEC, WEIGHT, samples=SAMPLES, at_least=(0.5, 2.0), forces=forces, margin=0.4, seed=5
     )
     # A function of its own, so that nothing compiled before is used.
     found = jax.jit(lambda contacts: ask(contacts))(grasps())

@@ -22,10 +22,11 @@ SAMPLED = 0.17
 
 def test_means_vary_as_with_the_same_draws_and_another_grasp():
     """The mean and the tail's mean, by what is known, by how little the rest is known, and by the load."""
+    two = jax.tree.map(lambda x: x[:2], grasps())
 
     def both(friction, spread, wrench):
         contacts = jg.Contacts.from_frames(
-            grasps().positions[:2], grasps().frames[:2], friction=friction, max_force=6.0, active=grasps().active[:2]
+            two.positions, two.frames, friction=friction, max_force=6.0, active=two.active
         )
         spec = jg.Uncertainty.of(position=spread, normal=0.05, mass=0.1)
         found = jg.margin_distribution(contacts, PUSHES, spec, wrench, samples=20, tail=0.25)
