@@ -1,4 +1,4 @@
-"""The field's metrics that have kernels: rates beside the margin's, and every answer against HiGHS.
+"""The field's metrics that have kernels: rates beside the margin's, and every answer against HiGHS or Qhull.
 
     python -m benchmarks.metric_kernels [--quick]
 
@@ -20,6 +20,7 @@ import jax
 import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
 
 import jaxgrasp as jg
 from benchmarks.suite.clock import Job, by_turns, say, warn_if_busy
@@ -32,6 +33,8 @@ CHECKED, TOGETHER, CHUNK = 20_000, 16, 512
 HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10, "presolve": False}
 RANK = 1e-9
 """Singular values below this share of the largest are zero."""
+SMALLEST = 1e-7
+"""Smaller balls count as none, in units of the longest wrench."""
 
 
 def rates() -> list[str]:
@@ -52,6 +55,8 @@ def rates() -> list[str]:
         jobs: dict[str, Job] = {
             name: functools.partial(run, jax.jit(program), contacts) for name, program in programs.items()
         }
+        # A search, which is not a part of a program.
+        jobs["ferrari_canny"] = functools.partial(run, metrics.ferrari_canny, contacts)
         timings = by_turns(jobs, ROUNDS)
         for name, timing in timings.items():
             share = timings["margin"].seconds / timing.seconds
@@ -101,23 +106,44 @@ def answers(W: np.ndarray) -> np.ndarray:
     return np.where(singular[:, 5] <= RANK * singular[:, 0], np.minimum(least, 0), least)
 
 
+def radii(W: np.ndarray) -> np.ndarray:
+    """The largest balls of grasps (k, m, 6) by Qhull; 0 where the wrenches do not span the space."""
+    found = np.zeros(len(W))
+    for row, w in enumerate(W):
+        points = np.concatenate([np.zeros((1, 6)), w])
+        singular = np.linalg.svd(points - points.mean(0), compute_uv=False)
+        if singular[5] > RANK * singular[0]:
+            found[row] = max(0.0, -ConvexHull(points).equations[:, -1].max())
+    return found
+
+
 def checks(count: int) -> list[str]:
-    """The largest differences from HiGHS."""
+    """The largest differences from HiGHS and Qhull."""
     contacts, space = checked_grasps(count), metrics.WrenchSpace()
     W = np.asarray(metrics.edge_wrenches(contacts, space)).reshape(count, -1, 6)
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        least = np.concatenate(list(pool.map(answers, [W[i : i + CHUNK] for i in range(0, count, CHUNK)])))
+        parts = [W[i : i + CHUNK] for i in range(0, count, CHUNK)]
+        least, balls = (np.concatenate(list(pool.map(answer, parts))) for answer in (answers, radii))
     found = jax.tree.map(np.asarray, metrics.force_closure(contacts, space))
     ours, finite = found.min_weight * W.shape[1], np.isfinite(least)
     assert (ours[~finite] == least[~finite]).all()
     difference = np.abs(ours - least)[finite]
     relative = difference / np.maximum(np.abs(least[finite]), 1e-2)
     wrong = (found.closed != (least > 1e-7)).sum()
+    facets = jax.tree.map(np.asarray, metrics.nearest_facet(contacts, space=space))
+    some = balls > SMALLEST * np.linalg.norm(W, axis=-1).max(-1)
+    assert (facets.radius[~some] <= 2 * SMALLEST * np.linalg.norm(W[~some], axis=-1).max(-1)).all()
+    apart = np.abs(facets.radius - balls)[some] / balls[some]
+    low = (1 - facets.lower_bound / np.where(some, balls, 1))[some]
     return [
         f"{count:,} grasps, of which {(~found.closed).mean():.0%} have no force closure; {np.isnan(ours).sum()} are "
         f"unsolved. Min-weights, times the number of edges, differ by at most {np.nanmax(difference):.1e}, and by "
         f"{np.nanmax(relative):.1e} of the larger of themselves and 0.01. `force_closure` differs on {wrong} of them "
-        "from HiGHS' min-weight above 1e-7."
+        "from HiGHS' min-weight above 1e-7.",
+        "",
+        f"`ferrari_canny` proves its answer on {(facets.status == jg.Status.SOLVED).sum():,} of them. It differs from "
+        f"Qhull's by at most {apart.max():.1e} of itself, and its lower bound is at most {low.max():.1e} below; where "
+        "Qhull's ball is smaller than 2e-7 of the longest wrench so is ours.",
     ]
 
 
@@ -134,11 +160,12 @@ def main() -> None:
             f"`python -m benchmarks.metric_kernels`, {os.cpu_count()} cores, "
             f"{llvm.processor().description.split(',')[0]}, load average at the start {load:.1f}.",
             "",
-            f"Four contacts, eight edges, batch {BATCH:,}, in a `jax.jit`, warm, by turns, best of {ROUNDS}.",
+            f"Four contacts, eight edges, batch {BATCH:,}, warm, by turns, best of {ROUNDS}. `ferrari_canny` is a search "
+            "of many programs; all others are in a `jax.jit`.",
             "",
             *rates(),
             "",
-            "## Against HiGHS, float64",
+            "## Against HiGHS and Qhull, float64",
             "",
             *checks(512 if quick else CHECKED),
             "",

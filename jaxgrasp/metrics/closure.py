@@ -7,14 +7,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgrasp.arrays import safe_divide
 from jaxgrasp.contact import Contacts
 from jaxgrasp.metrics.columns import over_grasps
-from jaxgrasp.metrics.least_weight import LeastWeight, least_weight, varying
+from jaxgrasp.metrics.least_weight import CLOSED, LeastWeight, least_weight, varying
 from jaxgrasp.metrics.wrench_space import WrenchSpace, edges_of, metric
 from jaxgrasp.records import record
 from jaxgrasp.solvers.dense.gauge import Gauge
 from jaxgrasp.solvers.status import Status
-
-# The solver's own accuracy, of weights that sum up to one times their number.
-_LEAST_WEIGHT = {"float64": 1e-7, "float32": 1e-4}
 
 
 @record
@@ -92,7 +89,7 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
     least = 1 - gauge.value
     # Edges that do not span the space close nothing, whether or not the program could be solved.
     known = found.valid & (found.solved | ~found.spans)
-    closed = known & found.spans & (least > _LEAST_WEIGHT[least.dtype.name])
+    closed = known & found.spans & (least > CLOSED[least.dtype.name])
     weights = jnp.where(edges.counted & closed[..., None], gauge.z + (least / found.number)[..., None], 0)
     weights = safe_divide(weights, weights.sum(-1, keepdims=True)).reshape(edges.wrenches.shape[:-1])
     forces = jnp.einsum("...ce,...cea->...ca", weights, edges.forces)
@@ -118,5 +115,5 @@ def force_closure(contacts: Contacts, space: WrenchSpace | None = None) -> Force
 def _told(found: LeastWeight, gauge: Gauge) -> jax.Array:
     """The least weight; 0 where it is not told from 0, or where edges that do not span the space have none below 0."""
     least = jnp.where(found.solved, 1 - gauge.value, jnp.nan)
-    zero = (jnp.abs(least) <= _LEAST_WEIGHT[least.dtype.name]) | (~found.spans & ~(least < 0))
+    zero = (jnp.abs(least) <= CLOSED[least.dtype.name]) | (~found.spans & ~(least < 0))
     return jnp.where(found.valid, jnp.where(zero, 0, least) / found.number, jnp.nan)

@@ -22,6 +22,9 @@ from jaxgrasp.solvers.dense.gauge import ACCEPTED, SETTINGS, Gauge, GaugeProblem
 # What is left of equal weights without the combinations of the rows, as a share: less is rounding.
 _FLAT = {"float64": 1e-13, "float32": 1e-5}
 
+CLOSED = {"float64": 1e-7, "float32": 1e-4}
+"""The solver's own accuracy, of weights that sum up to one times their number: there is closure above it."""
+
 
 class LeastWeight(NamedTuple):
     """The min-weight of grasps with its certificates; leaves (*batch, ...)."""

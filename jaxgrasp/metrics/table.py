@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.metrics.closure import force_closure, min_weight
-from jaxgrasp.metrics.hulls import ferrari_canny, wrench_space_volume
+from jaxgrasp.metrics.hulls import wrench_space_volume
 from jaxgrasp.metrics.largest_ball import ferrari_canny_bound
 from jaxgrasp.metrics.matrices import closure_residual, isotropy, smallest_singular_value
+from jaxgrasp.metrics.nearest_facet import ferrari_canny
 from jaxgrasp.metrics.task import task_wrench
 from jaxgrasp.metrics.wrench_space import WrenchSpace
 from jaxgrasp.robustness import largest_disturbance
@@ -47,14 +48,20 @@ class Metric:
     value: Callable[[Contacts, Setting], Any]
     """(*batch,) of a batch, or a float of one grasp."""
     batched: bool = True
-    """Whether it takes a batch under `jax.jit`."""
+    """Whether it takes a batch."""
+    traceable: bool = True
+    """Whether it can be a part of a caller's `jax.jit`."""
     formulation: str | None = None
     """The formulation of `formulation_margin` whose margin it is."""
     larger_is_better: bool = True
 
     def under_jit(self, disturbances: DisturbanceSet) -> bool:
         """Whether it takes a batch under `jax.jit` with this set."""
-        return self.batched and (self.formulation is None or not is_refined(disturbances, self.formulation))
+        return (
+            self.batched
+            and self.traceable
+            and (self.formulation is None or not is_refined(disturbances, self.formulation))
+        )
 
 
 def _margin(contacts: Contacts, setting: Setting) -> jax.Array:
@@ -113,24 +120,24 @@ METRICS = {
         ),
         Metric(
             name="ferrari_canny",
-            about="largest ball in the wrench space, sum of normal forces 1 (hull)",
+            about="largest ball in the wrench space, sum of normal forces 1",
             value=lambda c, s: ferrari_canny(c, "L1", s.space),
-            batched=False,
+            traceable=False,
         ),
         Metric(
             name="ferrari_canny_bound",
-            about="upper bound of ferrari_canny, mostly itself (batched)",
+            about="upper bound of ferrari_canny, mostly itself (differentiable)",
             value=lambda c, s: ferrari_canny_bound(c, "L1", s.space),
         ),
         Metric(
             name="ferrari_canny_linf",
-            about="the same, each normal force 1 (hull: seconds a grasp, few edges)",
+            about="the same, each normal force 1",
             value=lambda c, s: ferrari_canny(c, "Linf", s.space),
-            batched=False,
+            traceable=False,
         ),
         Metric(
             name="ferrari_canny_linf_bound",
-            about="upper bound of the largest ball, each normal force 1 (batched)",
+            about="upper bound of ferrari_canny_linf (differentiable)",
             value=lambda c, s: ferrari_canny_bound(c, "Linf", s.space),
         ),
         Metric(

@@ -132,20 +132,13 @@ def test_a_clock_counts_all_its_laps():
     assert str(clock).startswith("5 candidates in 0.") and "a second once" not in str(clock)
 
 
-def test_the_command_line_takes_the_edges_of_the_largest_ball(tmp_path, monkeypatch, capsys):
+def test_the_command_line_takes_the_edges_of_the_largest_ball(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     normals = np.random.default_rng(4).normal(size=(3, 5, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    # The grasp with the most contacts comes last, and is refused before the others are worked at.
-    active = np.arange(5) < np.array([[3], [3], [5]])
     fields = {"positions": 0.03 * normals, "outward_normals": normals, "friction": 0.8, "max_force": 5.0}
-    np.savez("five.npz", **fields, active=active)
     np.savez("three.npz", **fields, active=np.arange(5) < np.full((3, 1), 3))
     options = ["--metric", "ferrari_canny_linf", "--top", "0", "--output", "t.npz", "--figure", "None"]
-    assert main(["rank", "five.npz", *options]) == 2
-    refusal = capsys.readouterr().err
-    assert refusal.count("\n") == 1 and "--cone-edges 5)" in refusal and "ferrari_canny_linf_bound" in refusal
-    assert "5 contacts with 8 edges" in refusal
     found = {}
     for edges in (3, 4):
         assert main(["rank", "three.npz", *options, "--cone-edges", str(edges)]) == 0
@@ -154,5 +147,5 @@ def test_the_command_line_takes_the_edges_of_the_largest_ball(tmp_path, monkeypa
         space = jg.metrics.WrenchSpace(cone_edges=edges)
         for row in range(3):
             one = jg.Contacts.from_normals(0.03 * normals[row, :3], normals[row, :3], friction=0.8, max_force=5.0)
-            assert found[edges][row] == pytest.approx(jg.metrics.ferrari_canny(one, "Linf", space), abs=1e-12)
+            assert found[edges][row] == pytest.approx(float(jg.metrics.ferrari_canny(one, "Linf", space)), rel=1e-9)
     assert not np.allclose(found[3], found[4])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 
 import jax
 import numpy as np
@@ -141,14 +140,3 @@ def test_largest_balls_have_the_edges_that_one_asks_for(edges):
     sums = np.array([np.sum(choice, 0) for choice in itertools.product(*groups)])
     wanted = max(0.0, -ConvexHull(sums).equations[:, -1].max())
     np.testing.assert_allclose(METRICS["ferrari_canny_linf"].value(contacts, setting), wanted, atol=1e-9)
-
-
-@pytest.mark.parametrize(("count", "edges"), [(4, 12), (5, 8), (6, 8), (6, 4), (8, 3)])
-def test_refused_hulls_name_what_fits(count, edges):
-    normals = unit(np.random.default_rng(0).normal(size=(count, 3)))
-    contacts = jg.Contacts.from_normals(0.03 * normals, normals, friction=0.5, max_force=1.0)
-    with pytest.raises(ValueError, match="ferrari_canny_linf_bound") as refusal:
-        metrics.ferrari_canny(contacts, "Linf", WrenchSpace(cone_edges=edges))
-    advised = re.search(r"--cone-edges (\d+)", str(refusal.value))
-    most = max((n for n in range(3, edges) if (1 + n) ** count <= 10_000), default=None)
-    assert (advised and int(advised[1])) == most
