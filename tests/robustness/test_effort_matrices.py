@@ -374,7 +374,6 @@ def test_gradients_of_11(kinds):
         )
         options = {"compliance": compliance(x["Q"], kinds[0]), "effort_weights": x["weights"]}
         found = jg.least_total_effort(moved, vertices, asked, batch.load, **options)
-        return jnp.where(some, found.lower_bound, jnp.nan)[:, None]
+        return jnp.where(some, found.effort, jnp.nan)[:, None]
 
-    # Of the two bounds, which both vary as the effort does, the lower one is the closer: within 1e-9 as a rule.
-    check_gradients(values, [inputs(batch, Q=Q, weights=weights)], 4e-4, 2e-6, 0.6)
+    check_gradients(values, [inputs(batch, Q=Q, weights=weights)], 1e-4, 2e-6, 0.8)
