@@ -160,8 +160,8 @@ def main() -> None:
             f"`python -m benchmarks.metric_kernels`, {os.cpu_count()} cores, "
             f"{llvm.processor().description.split(',')[0]}, load average at the start {load:.1f}.",
             "",
-            f"Four contacts, eight edges, batch {BATCH:,}, warm, by turns, best of {ROUNDS}. `ferrari_canny` is a search "
-            "of many programs; all others are in a `jax.jit`.",
+            f"Four contacts, eight edges, batch {BATCH:,}, warm, by turns, best of {ROUNDS}. `ferrari_canny` is a "
+            "search of many programs; all others are in a `jax.jit`.",
             "",
             *rates(),
             "",

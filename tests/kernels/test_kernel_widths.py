@@ -103,7 +103,7 @@ def hold_against_xla(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray],
             continue
         loose = any(word in name for word in LOOSE) or "derivative" in program
         # First derivatives are as good as the multipliers.
-        loose |= (program.startswith("of ") or group.startswith("derivatives")) and dtype == "float32"
+        loose |= (program.startswith("of ") or group == "derivatives") and dtype == "float32"
         if loose and group == "margins" and dtype == "float32":
             # Of the forces of many contacts many are best; that these are is what bounds and the audit say.
             continue
@@ -113,6 +113,8 @@ def hold_against_xla(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray],
         if dtype == "float32":
             lanes = lanes[~proven_alone(ours, theirs, program, name, loose)[lanes]]
         several = loose and (dtype == "float32" or program.startswith("12"))
+        # Near a kink float32 is as far from float64 on XLA as here, in as many lanes.
+        several |= group == "derivatives, sets" and dtype == "float32"
         if len(lanes) > several * ELSEWHERE[dtype] * kernel_programs.LANES:
             wrong[name] = lanes.tolist()
     assert not wrong
