@@ -22,7 +22,7 @@ jax.config.update("jax_enable_x64", True)
 
 import jaxgrasp as jg  # noqa: E402
 from benchmarks.suite.clock import warn_if_busy  # noqa: E402
-from benchmarks.ways import FUNCTIONS, grasps, pushes  # noqa: E402
+from benchmarks.suite.face import FUNCTIONS, grasps, pushes  # noqa: E402
 
 SIZES = {"narrow": range(101, 201), "wide": range(66, 6403, 64)}
 PUSHES = pushes(6)

@@ -25,7 +25,7 @@ from jax.sharding import PartitionSpec as P  # noqa: E402
 
 import jaxgrasp as jg  # noqa: E402
 from benchmarks.suite.clock import by_turns, warn_if_busy  # noqa: E402
-from benchmarks.ways import FUNCTIONS, grasps, pushes  # noqa: E402
+from benchmarks.suite.face import FUNCTIONS, grasps, pushes  # noqa: E402
 from benchmarks.ways import slope as slope_of  # noqa: E402
 
 SENT = re.compile(r"\b(all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter)")

@@ -1,10 +1,11 @@
 """Every function of the package in every transformation of JAX, at several sizes, each cell in a process of its own.
 
-    python -m benchmarks.ways [--functions margin,effort] [--ways jit,scan] [--sizes 0,3,4096] [--kernels both]
+    python -m benchmarks.ways [--functions margin,effort] [--ways "jit;scan"] [--sizes 0,3,4096] [--kernels both]
 
 A cell runs one function in one way and holds the result against the plain batch: 1e-9 for values, 1e-6 for what goes
 through derivatives. It prints "ok", or what went wrong: a difference, an error, an abort of the process, or too much
-time. `benchmarks/ways.md` is what it wrote.
+time. With `--together` the ways of one function share a process until one of them ends it, which is several times
+faster. `benchmarks/ways.md` is what it wrote.
 """
 
 from __future__ import annotations
@@ -13,48 +14,26 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
+from jax.experimental import checkify, io_callback
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 import jaxgrasp as jg
+from benchmarks.suite.face import FUNCTIONS, grasps, pushes
 
 VALUES, SLOPES = 1e-9, 1e-6
 SECONDS = 300
-
-
-def grasps(count: int, contacts: int = 4) -> jg.Contacts:
-    normals = np.random.default_rng(5).normal(size=(count, contacts, 3))
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return jg.Contacts.from_normals(0.05 * normals, normals, friction=0.5, max_force=1.0)
-
-
-def pushes(vertices: int) -> jg.DisturbanceSet:
-    if vertices == 6:
-        return jg.DisturbanceSet.forces(1.0)
-    given = np.random.default_rng(6).normal(size=(vertices, 6))
-    return jg.DisturbanceSet.vertices(given * [1, 1, 1, 0.05, 0.05, 0.05])
-
-
-# Of contacts and a set; one float array (*batch, ...) each.
-FUNCTIONS: dict[str, Callable] = {
-    "margin": lambda c, d: jg.largest_disturbance(c, d, cone_edges=4).margin,
-    "effort": lambda c, d: jg.least_effort(c, d, 0.1, cone_edges=4).effort,
-    "worst_case": lambda c, d: jg.worst_case(c, d, cone_edges=4)[1],
-    "blocking": lambda c, d: jg.blocking_forces(c, d.terms[0].wrenches)[..., 0, :, :],
-    "margin_13": lambda c, d: jg.formulation_margin(c, d, "13", cone_edges=4).margin,
-    "min_weight": lambda c, d: jg.metrics.min_weight(c),
-    "closure": lambda c, d: jg.metrics.force_closure(c).min_weight,
-    "task_wrench": lambda c, d: jg.metrics.task_wrench(c, d),
-    "isotropy": lambda c, d: jg.metrics.isotropy(c),
-    "bound": lambda c, d: jg.metrics.ferrari_canny_bound(c),
-}
 
 
 def total(f: Callable, p: jax.Array, c: jg.Contacts) -> jax.Array:
@@ -80,6 +59,21 @@ def _custom_jvp(f: Callable, c: jg.Contacts) -> jax.Array:
     own = jax.custom_jvp(lambda p: total(f, p, c))
     own.defjvp(lambda p, dp: jax.jvp(lambda p: total(f, p, c), p, dp))
     return jax.grad(own)(c.positions)
+
+
+def _custom_vjp_nondiff(f: Callable, c: jg.Contacts) -> jax.Array:
+    own = jax.custom_vjp(lambda f, p: total(f, p, c), nondiff_argnums=(0,))
+    own.defvjp(lambda f, p: (total(f, p, c), p), lambda f, p, ct: (ct * jax.grad(lambda p: total(f, p, c))(p),))
+    return jax.grad(lambda p: own(f, p))(c.positions)
+
+
+def _transposed(f: Callable, c: jg.Contacts) -> jax.Array:
+    value, line = jax.linearize(lambda p: total(f, p, c), c.positions)
+    return jax.linear_transpose(line, c.positions)(jnp.ones_like(value))[0]
+
+
+def _ahead(c: jg.Contacts) -> jg.Contacts:
+    return jax.tree.map(lambda x: x[None], c)
 
 
 def _cond(f: Callable, c: jg.Contacts) -> jax.Array:
@@ -141,6 +135,55 @@ def _callback(f: Callable, c: jg.Contacts) -> jax.Array:
     return jax.jit(beside)(c)
 
 
+def _io_callback(f: Callable, c: jg.Contacts) -> jax.Array:
+    def beside(c: jg.Contacts) -> jax.Array:
+        value = f(c)
+        io_callback(lambda x: None, None, value, ordered=True)
+        return value
+
+    return jax.jit(beside)(c)
+
+
+def _checked(f: Callable, c: jg.Contacts) -> jax.Array:
+    def checking(c: jg.Contacts) -> jax.Array:
+        checkify.check(jnp.all(c.friction > 0), "no friction")
+        return f(c)
+
+    error, value = jax.jit(checkify.checkify(checking))(c)
+    error.throw()
+    return value
+
+
+def _exported(f: Callable, c: jg.Contacts) -> jax.Array:
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), c)
+    leaves, structure = jax.tree.flatten(like)
+    with jg.without_kernels():
+        program = export.export(jax.jit(lambda *x: f(jax.tree.unflatten(structure, x))))(*leaves)
+    return program.call(*jax.tree.leaves(c))
+
+
+def _threads(f: Callable, c: jg.Contacts) -> jax.Array:
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda _: jax.block_until_ready(jax.jit(lambda c: f(c))(c)), range(2))
+    assert np.array_equal(first, second, equal_nan=True)
+    return first
+
+
+def _nested(f: Callable, c: jg.Contacts) -> jax.Array:
+    mapped = lambda c: _shard_map(jax.vmap(f), c)  # noqa: E731
+    return jax.lax.scan(lambda s, c: (s, mapped(c)), 0, jax.tree.map(lambda x: x[None], c))[1][0]
+
+
+def _leaks(f: Callable, c: jg.Contacts) -> jax.Array:
+    with jax.checking_leaks():
+        return jax.jit(f)(c)
+
+
+def _no_jit(f: Callable, c: jg.Contacts) -> jax.Array:
+    with jax.disable_jit():
+        return f(c)
+
+
 # What each gives the plain call does, too,
 PLAIN: dict[str, Callable] = {
     "jit": lambda f, c: jax.jit(f)(c),
@@ -155,11 +198,20 @@ PLAIN: dict[str, Callable] = {
     "after associative_scan": lambda f, c: jax.jit(lambda c: f(jax.lax.associative_scan(lambda a, b: b, c)))(c),
     "while_loop": _while,
     "cond": _cond,
+    "switch": lambda f, c: jax.lax.switch(jnp.sum(c.active) % 2, [f, f], c),
+    "vmap of another axis": lambda f, c: jax.vmap(f, in_axes=1)(jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), c)),
     "beside a callback": _callback,
+    "beside an ordered callback": _io_callback,
+    "checkify": _checked,
+    "exported": _exported,
+    "two threads": _threads,
+    "checking leaks": _leaks,
+    "disable_jit": _no_jit,
     "divided": _divided(False),
     "divided, explicit": _divided(True),
     "shard_map": _shard_map,
     "vmap in shard_map": lambda f, c: _shard_map(jax.vmap(f), c),
+    "vmap in shard_map in scan": _nested,
     "shard_map in vmap": lambda f, c: jax.vmap(lambda c: _shard_map(f, c))(jax.tree.map(lambda x: x[None], c))[0],
     "set_mesh": _set_mesh,
     "pmap": _pmap,
@@ -172,6 +224,8 @@ FORWARD: dict[str, Callable] = {
     "linearize": lambda f, c: jax.linearize(lambda p: f(replace(c, positions=p)), c.positions)[1](
         jnp.ones_like(c.positions)
     ),
+    "jvp of vmap": lambda f, c: along(jax.vmap(f), c),
+    "jvp in fori_loop": lambda f, c: jax.lax.fori_loop(0, 1, lambda _, x: along(f, c) + 0 * x, along(f, c)),
 }
 # and what `slope` does.
 REVERSE: dict[str, Callable] = {
@@ -183,7 +237,16 @@ REVERSE: dict[str, Callable] = {
     "checkpoint, all saved": lambda f, c: slope(
         jax.checkpoint(f, policy=jax.checkpoint_policies.everything_saveable), c
     ),
+    "checkpoint, dots saved": lambda f, c: slope(jax.checkpoint(f, policy=jax.checkpoint_policies.dots_saveable), c),
+    "grad in scan": lambda f, c: jax.lax.scan(lambda s, c: (s, slope(f, c)), 0, jax.tree.map(lambda x: x[None], c))[1][
+        0
+    ],
+    "grad of scan": lambda f, c: slope(lambda c: jax.lax.scan(lambda s, c: (s, f(c)), 0, _ahead(c))[1], c),
+    "grad of lax.map": lambda f, c: slope(lambda c: jax.lax.map(f, c, batch_size=2), c),
+    "vmap of vmap grad": lambda f, c: jax.vmap(jax.vmap(lambda c: slope(f, c)))(_ahead(c))[0],
+    "transpose of linearize": lambda f, c: _transposed(f, c),
     "custom_vjp": _custom_vjp,
+    "custom_vjp, nondiff": _custom_vjp_nondiff,
     "custom_jvp": _custom_jvp,
     "slope, divided": lambda f, c: _divided(False)(lambda c: slope(f, c), c),
     "slope, shard_map": lambda f, c: _shard_map(lambda c: slope(f, c), c),
@@ -191,8 +254,15 @@ REVERSE: dict[str, Callable] = {
 WAYS = PLAIN | FORWARD | REVERSE
 SLOPED = dict.fromkeys(FORWARD, along) | dict.fromkeys(REVERSE, slope)
 EVEN = {
-    *("divided", "divided, explicit", "shard_map", "vmap in shard_map", "shard_map in vmap", "pmap"),
-    *("slope, divided", "slope, shard_map"),
+    *(
+        "divided",
+        "divided, explicit",
+        "shard_map",
+        "vmap in shard_map",
+        "vmap in shard_map in scan",
+        "shard_map in vmap",
+    ),
+    *("pmap", "slope, divided", "slope, shard_map"),
 }
 
 
@@ -223,48 +293,76 @@ def main() -> None:
     parser.add_argument("--contacts", type=int, default=4)
     parser.add_argument("--kernels", choices=("auto", "xla", "both"), default="both")
     parser.add_argument("--output", type=Path)
-    parser.add_argument("--one", action="store_true", help="this cell, in this process")
+    parser.add_argument("--one", action="store_true", help="these ways of one function, in this process")
+    parser.add_argument("--together", action="store_true", help="the ways of a function share a process")
     given = parser.parse_args()
     functions, ways = given.functions.split(","), given.ways.split(";")
     sizes = [int(size) for size in given.sizes.split(",")]
     if given.one:
         jax.config.update("jax_enable_x64", True)
         jax.config.update("jax_num_cpu_devices", 2)
-        print(cell(functions[0], ways[0], sizes[0], given.vertices, given.contacts))
+        for way in ways:
+            print(_tried(functions[0], way, sizes[0], given), flush=True)
         return
     kernels = ("auto", "xla") if given.kernels == "both" else (given.kernels,)
-    rows = [(f, w, s, k) for k in kernels for f in functions for s in sizes for w in ways]
     lines = ["| function | way | grasps | kernels | result |", "|---|---|---|---|---|"]
     bad = 0
-    for function, way, size, kernel in rows:
-        result = _in_process(function, way, size, kernel, given)
-        bad += result != "ok"
-        lines.append(f"| {function} | {way} | {size:,} | {kernel} | {result} |")
-        print(lines[-1], flush=True)
-        if given.output:
-            given.output.write_text("\n".join([*lines, "", f"{len(lines) - 2} cells, {bad} not ok.", ""]))
-    print(f"{len(rows)} cells, {bad} not ok")
+    for kernel, function, size in ((k, f, s) for k in kernels for f in functions for s in sizes):
+        for way, result in _in_processes(function, ways, size, kernel, given):
+            bad += result != "ok"
+            lines.append(f"| {function} | {way} | {size:,} | {kernel} | {result} |")
+            print(lines[-1], flush=True)
+            if given.output:
+                given.output.write_text("\n".join([*lines, "", f"{len(lines) - 2} cells, {bad} not ok.", ""]))
+    print(f"{len(lines) - 2} cells, {bad} not ok")
 
 
-def _in_process(function: str, way: str, size: int, kernel: str, given: argparse.Namespace) -> str:
-    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.ways", "--one", "--functions", function]
-    command += ["--ways", way, "--sizes", str(size), "--vertices", str(given.vertices)]
-    command += ["--contacts", str(given.contacts)]
+def _tried(function: str, way: str, size: int, given: argparse.Namespace) -> str:
     try:
-        run = subprocess.run(
-            command,
-            env={**os.environ, "JAXGRASP_KERNELS": kernel},
-            capture_output=True,
-            text=True,
-            timeout=SECONDS,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return f"more than {SECONDS} s"
-    if run.returncode == 0:
-        return run.stdout.strip()
-    last = (run.stderr.strip().splitlines() or [""])[-1]
-    return f"exit {run.returncode}: {last[:100]}"
+        return cell(function, way, size, given.vertices, given.contacts)
+    except Exception as error:
+        return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:150]}"
+
+
+def _in_processes(
+    function: str, ways: list[str], size: int, kernel: str, given: argparse.Namespace
+) -> Iterator[tuple[str, str]]:
+    """Ways with what came of each; a process runs one, or all until one of them ends it."""
+    left = list(ways)
+    while left:
+        tried = left if given.together else left[:1]
+        for way, result in zip(list(tried), _in_process(function, tried, size, kernel, given), strict=False):
+            left.remove(way)
+            yield way, result
+
+
+def _in_process(function: str, ways: list[str], size: int, kernel: str, given: argparse.Namespace) -> Iterator[str]:
+    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.ways", "--one", "--functions", function]
+    command += ["--ways", ";".join(ways), "--sizes", str(size), "--vertices", str(given.vertices)]
+    command += ["--contacts", str(given.contacts)]
+    environment = {**os.environ, "JAXGRASP_KERNELS": kernel}
+    with tempfile.TemporaryFile("w+") as told:
+        child = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=told, text=True)
+        assert child.stdout is not None
+        late = threading.Event()
+
+        def stop() -> None:
+            late.set()
+            child.kill()
+
+        for _ in ways:
+            timer = threading.Timer(SECONDS, stop)
+            timer.start()
+            line = child.stdout.readline()
+            timer.cancel()
+            if not line:
+                child.wait()
+                told.seek(0)
+                last = (told.read().strip().splitlines() or [""])[-1]
+                yield f"more than {SECONDS} s" if late.is_set() else f"exit {child.returncode}: {last[:100]}"
+                return
+            yield line.strip()
+        child.wait()
 
 
 if __name__ == "__main__":
