@@ -51,7 +51,7 @@ FUNCTIONS: dict[str, Callable] = {
     "task_wrench": lambda c, d: jg.metrics.task_wrench(c, d),
     "isotropy": lambda c, d: jg.metrics.isotropy(c),
     "bound": lambda c, d: jg.metrics.ferrari_canny_bound(c),
-    "bound, Linf": lambda c, d: jg.metrics.ferrari_canny_bound(c, "Linf"),
+    "bound Linf": lambda c, d: jg.metrics.ferrari_canny_bound(c, "Linf"),
     "singular": lambda c, d: jg.metrics.smallest_singular_value(c),
     "residual": lambda c, d: jg.metrics.closure_residual(c),
     "solve_qp": lambda c, d: program(c),
