@@ -3,13 +3,14 @@
 The wrenches that a grasp can exert form a polytope H with support function h(u), and the largest ball in it about the
 origin has the radius min h(u) over unit u. Its polar {n : h(n) <= 1} turns that round: the radius is 1 / max |n|, and
 every n of the polar proves that the radius is at most 1 / |n|. Maximising |n|, which is convex, has many local maxima:
-vertices of the polar, which are facets of H. From each of several starts affine scaling (Dikin, 1967) walks to one of
-them, with the objective made linear anew at every step, so that |n| only grows; the best counts.
+vertices of the polar, which are facets of H. From each of several starts the simplex method walks to one of them, with
+the objective made linear anew at every step, so that |n| only grows; the best counts. A vertex is where rows are
+active, so rounding that differs, as in another batch, ends at the same numbers.
 """
 
 import math
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,18 +23,20 @@ from jaxgrasp.arrays import literal, safe_divide
 from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.lanes.independent import one_lane
-from jaxgrasp.metrics.interior import SMALLEST_BALL, contains_origin
+from jaxgrasp.metrics.interior import contains_origin
 from jaxgrasp.metrics.wrench_space import WrenchSpace, checked, edges_of, hidden
 
 Norm = Literal["L1", "Linf"]
 
-# From twelve principal and twelve fixed random directions, then once more from the best. A step leaves a tenth of the
-# nearest slack.
-_RANDOM_STARTS, _STEPS, _LAST_STEPS = 12, 11, 11
-_STRIDE = 0.9
-# The polar of a grasp without force closure has no bound, and that of others is no longer than this, in units of one
-# over the longest wrench: n is kept in a box of this size.
-_REACH = {name: 1 / radius for name, radius in SMALLEST_BALL.items()}
+# Fixed random directions, and how many of them are also turned to where wrenches are short. The longest of some 10,000
+# walks had 24 pivots.
+_STARTS, _TURNED, _MOST_PIVOTS = 12, 6, 60
+# Rows are equally near within this, in units of the largest variable.
+_NEAR = {"float64": 1e-12, "float32": 1e-5}
+# What of an edge or a multiplier is rounding, in units of the machine's.
+_NOTHING = 1000
+# Of equal choices that of the larger weight is made, so that rounding never chooses.
+_MOST_WEIGHT = 1.1
 
 
 def ferrari_canny_bound(
@@ -86,13 +89,28 @@ def _radius(wrenches: jax.Array) -> jax.Array:
     W = wrenches / scale
     closed = contains_origin(W.reshape(-1, 6))
     n, weights = one_lane(lambda _, W: _farthest(W), longest > 0, lax.stop_gradient(W))
-    # The last step of a walk along an unbounded polar may have none.
-    weights = jnp.where(jnp.isfinite(weights), weights, 0)
     size = jnp.sqrt(n @ n)
     # Of max 1/2 n'n the derivative is that of the Lagrangian, - weights n'dw; the value stays what it is.
     reach = jnp.sum(weights * (W @ n))
-    value = 1 / size + safe_divide(reach - lax.stop_gradient(reach), size**3)
+    value = safe_divide(_support(lax.stop_gradient(W), n), size) + safe_divide(
+        reach - lax.stop_gradient(reach), size**3
+    )
     return jnp.where(closed, scale * value, 0)
+
+
+def _support(W: jax.Array, direction: jax.Array) -> jax.Array:
+    return jnp.sum(jnp.maximum(jnp.max(W @ direction, -1), 0))
+
+
+class _Vertex(NamedTuple):
+    """Where a walk is, in the variables x = (n, t) of the rows a'x <= b."""
+
+    x: jax.Array
+    """(6 + g,)."""
+    edges: jax.Array
+    """(6 + g, 6 + g): along column j row `active[j]` changes by one, and no other active one changes."""
+    active: jax.Array
+    """(6 + g,), the rows that are active, of which there are as many at a vertex; -1 for none."""
 
 
 def _farthest(W: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -101,46 +119,83 @@ def _farthest(W: jax.Array) -> tuple[jax.Array, jax.Array]:
     With t (g,) for the groups the polar is {n : w'n <= t, t >= 0, sum t <= 1}.
     """
     groups, dtype = W.shape[0], W.dtype
-    random = np.random.default_rng(0).normal(size=(_RANDOM_STARTS, 6))
-    principal = linalg.right_singular(W.reshape(-1, 6))[1].T
-    starts = jnp.concatenate([principal, -principal, literal(random, dtype)])
-    middle = jnp.full(groups, 1 / (groups + 1), dtype)
-
-    def walk(n: jax.Array, t: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
-        return lax.fori_loop(0, steps, lambda _, at: _step(W, at[0], at[1], at[0])[:2], (n, t))
-
-    def from_start(direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        n, t, _ = _step(W, jnp.zeros(6, dtype), middle, direction)
-        return walk(n, t, _STEPS)
-
-    n, t = jax.vmap(from_start)(starts)
-    best = jnp.argmax(jnp.sum(n * n, -1))
-    n, t = walk(n[best], t[best], _LAST_STEPS)
-    return n, _step(W, n, t, n)[2]
+    starts = _starts(W.reshape(-1, 6))
+    own = jnp.concatenate([W, jnp.broadcast_to(-jnp.eye(groups, dtype=dtype)[:, None], (*W.shape[:2], groups))], -1)
+    rest = np.block([[np.zeros((groups, 6)), -np.eye(groups)], [np.zeros((1, 6)), np.ones((1, groups))]])
+    rows = jnp.concatenate([own.reshape(-1, 6 + groups), literal(rest, dtype)])
+    sides = literal(np.arange(len(rows)) == len(rows) - 1, dtype)
+    middle = jnp.concatenate([jnp.zeros(6, dtype), jnp.full(groups, 1 / (groups + 1), dtype)])
+    ends = jax.vmap(lambda start: _climb(rows, sides, _fall(rows, sides, middle, start)))(starts)
+    end = jax.tree.map(lambda x: x[jnp.argmax(jnp.sum(ends.x[:, :6] ** 2, -1))], ends)
+    multipliers = jnp.zeros(len(rows), dtype).at[end.active].set(jnp.maximum(end.x[:6] @ end.edges[:6], 0))
+    return end.x[:6], multipliers[: W.shape[0] * W.shape[1]].reshape(W.shape[:2])
 
 
-def _step(W: jax.Array, n: jax.Array, t: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """One step along the direction in the metric of the slacks, and the multipliers that it shows."""
-    reach = _REACH[W.dtype.name]
-    slack = partial(_slack, W)
-    s, rest = slack(n, t), 1 - jnp.sum(t)
-    d = 1 / s
-    scaled = d[..., None] * W
-    across = -jnp.einsum("gki,gk->gi", scaled, d)
-    own = jnp.einsum("gki,gkj->ij", scaled, scaled) + jnp.diag(1 / (reach - n) ** 2 + 1 / (reach + n) ** 2)
-    others = jnp.diag(jnp.sum(d * d, -1) + 1 / t**2) + 1 / rest**2
-    right = jnp.concatenate([direction, jnp.zeros_like(t)])
-    move = linalg.solve_positive(jnp.block([[own, across.T], [across, others]]), right[:, None])[:, 0]
-    dn, dt = move[:6], move[6:]
-    fall = W @ dn - dt[:, None]
-    used = jnp.concatenate([(fall * d).ravel(), -dt / t, jnp.sum(dt)[None] / rest, dn / (reach - n), -dn / (reach + n)])
-    share = _STRIDE / jnp.max(used)
-    new_n, new_t = n + share * dn, t + share * dt
-    # Rounding ends the walk: at a vertex six slacks go to zero.
-    inside = (jnp.min(slack(new_n, new_t)) > 0) & (jnp.min(new_t) > 0) & (jnp.sum(new_t) < 1)
-    inside &= jnp.all(jnp.abs(new_n) < reach) & (new_n @ new_n >= n @ n)
-    return jnp.where(inside, new_n, n), jnp.where(inside, new_t, t), d * d * fall
+def _starts(W: jax.Array) -> jax.Array:
+    """Directions (starts, 6). They are smooth functions of the wrenches, as singular vectors are not."""
+    random = literal(np.random.default_rng(0).normal(size=(_STARTS, 6)), W.dtype)
+    square = W.T @ W
+    square += jnp.finfo(W.dtype).eps * jnp.trace(square) * jnp.eye(6, dtype=W.dtype)
+    turned = linalg.solve_positive(square, random[:_TURNED].T).T
+    return jnp.concatenate([random, turned, -turned])
 
 
-def _slack(W: jax.Array, n: jax.Array, t: jax.Array) -> jax.Array:
-    return t[:, None] - W @ n
+def _weights(count: int, dtype: jnp.dtype) -> jax.Array:
+    return literal(np.random.default_rng(count).uniform(1, _MOST_WEIGHT, count), dtype)
+
+
+def _fall(rows: jax.Array, sides: jax.Array, x: jax.Array, start: jax.Array) -> _Vertex:
+    """From a point inside to a vertex: along `start`, then along n as far as the active rows let it."""
+
+    def hit(step: jax.Array, at: _Vertex) -> _Vertex:
+        gains = jnp.where(step == 0, start, at.x[:6]) @ at.edges[:6]
+        free = jnp.where(at.active < 0, gains / jnp.sum(at.edges**2, 0), 0)
+        return _pivot(rows, sides, at, free)[0]
+
+    # Like the rows also where these vary over devices.
+    zero = 0 * x
+    inside = _Vertex(x, jnp.eye(len(x), dtype=x.dtype) + zero, jnp.full_like(zero, -1, jnp.int32))
+    return lax.fori_loop(0, len(x), hit, inside)
+
+
+def _climb(rows: jax.Array, sides: jax.Array, vertex: _Vertex) -> _Vertex:
+    """From vertex to vertex along the edge on which |n| grows most, to one from which it grows along none."""
+
+    def slopes(at: _Vertex) -> jax.Array:
+        return at.x[:6] @ at.edges[:6] / jnp.sqrt(jnp.sum(at.edges**2, 0)) * _weights(len(at.x), at.x.dtype)
+
+    def ends(state: tuple[_Vertex, jax.Array]) -> jax.Array:
+        at, pivots = state
+        least = -_NOTHING * jnp.finfo(at.x.dtype).eps * jnp.sqrt(at.x[:6] @ at.x[:6])
+        return (jnp.min(slopes(at)) < least) & (pivots < _MOST_PIVOTS)
+
+    def pivot(state: tuple[_Vertex, jax.Array]) -> tuple[_Vertex, jax.Array]:
+        at, pivots = state
+        leaving = jnp.arange(len(at.x)) == jnp.argmin(slopes(at))
+        at, bounded = _pivot(rows, sides, at, jnp.where(leaving, -1, 0).astype(at.x.dtype))
+        return at, jnp.where(bounded, pivots + 1, _MOST_PIVOTS)
+
+    return lax.while_loop(ends, pivot, (vertex, jnp.zeros((), jnp.int32)))[0]
+
+
+def _pivot(rows: jax.Array, sides: jax.Array, at: _Vertex, shares: jax.Array) -> tuple[_Vertex, jax.Array]:
+    """Go along the edges by their shares to the next row, which takes the place of one of them; and whether one is."""
+    rounding = jnp.finfo(rows.dtype).eps
+    along = at.edges @ shares
+    rate = rows @ along
+    nearing = rate > _NOTHING * rounding * jnp.sqrt(along @ along)
+    rate = jnp.where(nearing, rate, 1)
+    slack = jnp.maximum(sides - rows @ at.x, 0)
+    way = jnp.where(nearing, slack / rate, jnp.inf)
+    # Of rows that are equally near but for rounding (Harris, 1973) the one that is met most steeply.
+    allowed = _NEAR[rows.dtype.name] * jnp.maximum(1, jnp.max(jnp.abs(at.x)))
+    nearest = jnp.min(jnp.where(nearing, (slack + allowed) / rate, jnp.inf))
+    row = jnp.argmax(jnp.where(nearing & (way <= nearest), rate * _weights(len(rows), rows.dtype), -1))
+    left = jnp.arange(len(shares)) == jnp.argmax(
+        jnp.abs(shares) * jnp.sqrt(jnp.sum(at.edges**2, 0)) * _weights(len(shares), shares.dtype)
+    )
+    met = along / rate[row]
+    edges = jnp.where(left, met[:, None], at.edges - met[:, None] * (rows[row] @ at.edges))
+    new = _Vertex(at.x + way[row] * along, edges, jnp.where(left, row.astype(jnp.int32), at.active))
+    bounded = jnp.any(nearing)
+    return jax.tree.map(lambda new, old: jnp.where(bounded, new, old), new, at), bounded
