@@ -94,13 +94,14 @@ def unify_types(leaves: Sequence[jax.Array], shared: Sequence[bool]) -> list[jax
         if union - axes:
             leaves[i] = jax.lax.pcast(leaves[i], tuple(sorted(union - axes)), to="varying")
     # On a mesh with explicit axes: divide all leaves as the first one that is divided.
-    if not any(_has_explicit_axes(x) for x in leaves):
+    mesh = next((jax.typeof(x).sharding.mesh for x in leaves if _has_explicit_axes(x)), None)
+    if mesh is None:
         return leaves
     lead = next((s for s in (_lead(x) for x, s in zip(leaves, shared, strict=True) if not s) if s is not None), None)
     specs = [_lane_spec(None if s else lead, x.ndim) for x, s in zip(leaves, shared, strict=True)]
     return [
         x if not _has_explicit_axes(x) and not tuple(filter(None, spec)) or jax.typeof(x).sharding.spec == spec
-        else jax.sharding.reshard(x, spec)
+        else jax.sharding.reshard(x, NamedSharding(mesh, spec))
         for x, spec in zip(leaves, specs, strict=True)
     ]  # fmt: skip
 

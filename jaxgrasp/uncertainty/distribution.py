@@ -17,6 +17,7 @@ from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance
 from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.lanes.independent import with_automatic_axes
 from jaxgrasp.records import record
 from jaxgrasp.robustness import largest_disturbance
 from jaxgrasp.robustness.interface.arguments import GraspData, Options, lay_out
@@ -207,22 +208,27 @@ def _run(
     draws = draw(uncertainty, data.contacts.n_c, question.count, seed, dtype)
     batch = lay_out(data, options).batch
     grasps, own = lanes_of(data, options, forces, batch)
-    leaves, structure = jax.tree.flatten(grasps)
+    leaves, structure = jax.tree.flatten((grasps, draws, thresholds.astype(dtype)))
     own = jax.tree.leaves(own)
+    shared = [not has_lanes for has_lanes in own] + [True] * (len(leaves) - len(own))
     # Few grasps at a time, so that their margins can be kept.
     count = math.prod(batch)
     chunks = max(1, -(-count // max(1, min(_SOLVED, _KEPT // question.count))))
     size = max(1, -(-count // chunks))
 
-    @jax.checkpoint
-    def one(some: list[jax.Array]) -> MarginDistribution:
-        rest = iter(some)
-        parts = [next(rest) if has_lanes else x for x, has_lanes in zip(leaves, own, strict=True)]
-        return _of_some(question, jax.tree.unflatten(structure, parts), draws, thresholds.astype(dtype))
+    def all_lanes(*leaves: jax.Array) -> MarginDistribution:
+        @jax.checkpoint
+        def one(some: list[jax.Array]) -> MarginDistribution:
+            rest = iter(some)
+            parts = [x if is_shared else next(rest) for x, is_shared in zip(leaves, shared, strict=True)]
+            return _of_some(question, *jax.tree.unflatten(structure, parts))
 
-    some = [divided(x, chunks, size) for x, has_lanes in zip(leaves, own, strict=True) if has_lanes]
-    found = jax.lax.map(one, some)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count].reshape(*batch, *x.shape[2:]), found)
+        some = [divided(x, chunks, size) for x, is_shared in zip(leaves, shared, strict=True) if not is_shared]
+        found = jax.lax.map(one, some)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+
+    found = with_automatic_axes(all_lanes, leaves, shared)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), found)
 
 
 def _of_some(question: _Question, grasps: Grasps, draws: Draws, thresholds: jax.Array) -> MarginDistribution:

@@ -7,7 +7,7 @@ Calafiore and Campi). Most rows of most draws follow from others: those that are
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -21,6 +21,7 @@ from jaxgrasp.contact.contacts import Contacts
 from jaxgrasp.contact.friction import pyramid_facets
 from jaxgrasp.contact.grasp_map import grasp_map
 from jaxgrasp.disturbance import DisturbanceSet
+from jaxgrasp.lanes.independent import with_automatic_axes
 from jaxgrasp.records import record
 from jaxgrasp.robustness import least_effort, weighted_pseudo_inverse, worst_case
 from jaxgrasp.solvers import solve_qp
@@ -138,7 +139,24 @@ def _tighten(
         disturbances = flat(disturbances.spread_over(batch))
     load = jnp.zeros(6, dtype) if wrench is None else wrench.astype(dtype)
     grasps = _Known(flat(spread), disturbances, flat(jnp.broadcast_to(load, (*batch, 6))), flat(margin))
+    own = jax.tree.map(lambda _: False, grasps)
+    own = replace(own, disturbances=jax.tree.map(lambda _: not disturbances.batch_shape, disturbances))
+    arguments = (grasps, start.reshape(lanes, 3 * n), known.reshape(lanes), draws)
+    shared = jax.tree.leaves((own, False, False, jax.tree.map(lambda _: True, draws)))
+    leaves, structure = jax.tree.flatten(arguments)
+    tightened = lambda *leaves: _tighten_lanes(question, *jax.tree.unflatten(structure, leaves))
+    forces, effort, status = with_automatic_axes(tightened, leaves, shared)
+    return forces.reshape(*batch, n, 3), effort.reshape(batch), status.reshape(batch)
+
+
+def _tighten_lanes(
+    question: _Scenarios, grasps: "_Known", start: jax.Array, known: jax.Array, draws: Draws
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Do the same for grasps (lanes,) and draws (tiles, draws)."""
+    (lanes, size), n, dtype = start.shape, start.shape[1] // 3, start.dtype
     count = n * (question.cone_edges + 1)
+    # Of the type of the forces, also where these vary over devices.
+    filled = lambda value, *shape: jnp.full_like(start[:, :1], value, shape=(lanes, *shape))
 
     def worst(forces: jax.Array) -> _Rows:
         """The rows of the draws that are violated most by forces (lanes, 3 n), one of each kind."""
@@ -153,11 +171,7 @@ def _tighten(
             chosen = lambda a, b: jnp.where(more.reshape(*more.shape, *[1] * (a.ndim - 2)), a, b)
             return jax.tree.map(chosen, found, best), None
 
-        none = _Rows(
-            jnp.zeros((lanes, count, 3 * n), dtype),
-            jnp.ones((lanes, count), dtype),
-            jnp.full((lanes, count), -jnp.inf, dtype),
-        )
+        none = _Rows(filled(0, count, size), filled(1, count), filled(-jnp.inf, count))
         return jax.lax.scan(look, none, draws)[0]
 
     G = grasp_map(grasps.contacts)[:, 0]
@@ -172,18 +186,16 @@ def _tighten(
         better = (solved.status == Status.SOLVED)[:, None]
         return (rows, sides, jnp.where(better, solved.x, forces), infeasible), None
 
-    rows = jnp.zeros((lanes, _ROUNDS * count, 3 * n), dtype)
-    first = jnp.nan_to_num(start.reshape(lanes, 3 * n))
-    state = (rows, jnp.ones(rows.shape[:2], dtype), first, jnp.zeros(lanes, bool))
+    rows, sides = filled(0, _ROUNDS * count, size), filled(1, _ROUNDS * count)
+    state = (rows, sides, jnp.nan_to_num(start), filled(0).astype(bool))
     (_, _, forces, infeasible), _ = jax.lax.scan(tighten, state, jnp.arange(_ROUNDS))
     violated = worst(forces).over.max(-1) > _ACCEPTED[dtype.name] * jnp.max(grasps.contacts.max_force, (1, 2))
     status = jnp.where(violated, Status.MAX_ITERATIONS, Status.SOLVED)
     status = jnp.where(infeasible, Status.INFEASIBLE, status)
-    status = jnp.where(known.reshape(lanes) != Status.SOLVED, known.reshape(lanes), status).astype(jnp.int32)
+    status = jnp.where(known != Status.SOLVED, known, status).astype(jnp.int32)
     answered = (status == Status.SOLVED) | (status == Status.MAX_ITERATIONS)
     forces = jnp.where(answered[:, None], forces, jnp.nan)
-    effort = 0.5 * (forces**2).sum(-1)
-    return forces.reshape(*batch, n, 3), effort.reshape(batch), status.reshape(batch)
+    return forces, 0.5 * (forces**2).sum(-1), status
 
 
 @jax.tree_util.register_dataclass
