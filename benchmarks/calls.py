@@ -26,11 +26,7 @@ from benchmarks.suite.face import FUNCTIONS, grasps, pushes  # noqa: E402
 
 SIZES = {"narrow": range(101, 201), "wide": range(66, 6403, 64)}
 PUSHES = pushes(6)
-MORE = {
-    "total effort": lambda c, d: jg.least_total_effort(c, d, 0.1, cone_edges=4).effort,
-    "compare": lambda c, d: jax.tree.leaves(jg.compare_formulations(c, d, cone_edges=4))[0],
-}
-ALL = FUNCTIONS | MORE
+ALL = FUNCTIONS | {"explain": lambda c, d: jg.explain(c, d, cone_edges=4).position_gain}
 
 
 def second_call(name: str, contacts: jg.Contacts) -> tuple[float, int]:

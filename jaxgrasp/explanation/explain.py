@@ -1,6 +1,7 @@
 """What ends a grasp's margin, and what would raise it."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from jaxgrasp.compiling import by_size, compiled
 from jaxgrasp.contact import Actuation, Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.explanation.zero_margins import REASONS, is_zero, reasons
@@ -195,8 +197,14 @@ def _direction(
     rows = jnp.moveaxis(taken[:6] - taken[6:], 0, -1).reshape(*batch, -1, 6)
     shares = shares.reshape(*batch, -1)
     row = jnp.take_along_axis(rows, jnp.argmax(shares, -1)[..., None, None], -2)
-    worst = jax.grad(lambda a: jnp.sum(disturbances.support(a)))(row)[..., 0, :]
+    worst = _furthest(disturbances, row)[..., 0, :]
     return jnp.where(shares.max(-1, keepdims=True) > 0, worst, jnp.nan)
+
+
+@partial(compiled, pace=by_size)
+def _furthest(disturbances: DisturbanceSet, rows: jax.Array) -> jax.Array:
+    """The members of a set, like the rows a, that attain h_D(a)."""
+    return jax.grad(lambda a: jnp.sum(disturbances.support(a)))(rows)
 
 
 def _losses(contacts: Contacts, disturbances: DisturbanceSet, settings: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
