@@ -35,7 +35,7 @@ def program(c: jg.Contacts) -> jax.Array:
     return found.x
 
 
-def uncertain(**more: object) -> jg.Uncertainty:
+def uncertain(**more: float) -> jg.Uncertainty:
     return jg.Uncertainty.of(friction=jg.uncertainty.uniform(0.05), max_force=jg.uncertainty.uniform(0.05), **more)
 
 

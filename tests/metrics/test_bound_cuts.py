@@ -23,7 +23,8 @@ NORMALS = {
 
 def turned(name: str, dtype: str = "float64") -> jg.Contacts:
     """Symmetric grasps that lie askew."""
-    normals = np.einsum("nij,cj->nci", Rotation.random(COUNT, random_state=1).as_matrix(), NORMALS[name]).astype(dtype)
+    turns = Rotation.from_quat(np.random.default_rng(1).normal(size=(COUNT, 4))).as_matrix()
+    normals = np.einsum("nij,cj->nci", turns, NORMALS[name]).astype(dtype)
     return jg.Contacts.from_normals(0.05 * normals, normals, friction=0.6, max_force=1.0)
 
 
