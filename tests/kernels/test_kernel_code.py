@@ -221,6 +221,36 @@ def test_large_loops_read_what_they_carry():
     assert_same(function, rows(9, 6, 500))
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_long_loops_read_and_stack_what_is_computed(dtype):
+    """Arrays computed before the loops, in a round of the loop around them, or stacked by a loop before."""
+
+    def function(x, table):
+        fixed, marks = jnp.abs(x) * 2 + jnp.abs(table), x > 0
+
+        def one(sums, parts):
+            a, b, mark = parts
+            whole = jnp.where(mark, a / (1 + b), a + b)
+            return 0.5 * sums + whole, (whole[None], jnp.full_like(whole, 2), mark | (a > b), sums)
+
+        def again(sums, parts):
+            (whole,), two, flag, before = parts
+            return 0.5 * sums + jnp.where(flag, whole, two * whole), whole + 0.1 * before
+
+        def round_of(state):
+            step, y, total = state
+            moving = jnp.roll(y, 1, 0) * 0.5 + fixed
+            total, stacked = lax.scan(one, total, (fixed, moving, marks))
+            total, last = lax.scan(again, total, stacked)
+            return step + 1, y * 0.9 + last / (1 + last * last), total
+
+        unfinished = lambda state: (state[0] < 30) & jnp.any(state[1][0] < 3 + jnp.abs(x[1]))
+        with loops():
+            return lax.while_loop(unfinished, round_of, (jnp.zeros((), jnp.int32), jnp.abs(x), x[0] * 0))[1:]
+
+    assert_same(function, rows(37, 80, dtype=dtype), rows(80, dtype=dtype, seed=2), shared=(False, True))
+
+
 def test_grasps_of_twenty_contacts_have_kernels(monkeypatch):
     """As many as a hand has links; of (21), and of (22), whose program is the larger one."""
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 from jaxgrasp.kernels.code.values import ValueCode
 from jaxgrasp.kernels.cpu.handler import POINTERS
 from jaxgrasp.kernels.cpu.registers import Registers
-from jaxgrasp.kernels.program.expressions import Address, Value
+from jaxgrasp.kernels.program.expressions import Address, Table, Value
 from jaxgrasp.kernels.program.lowering import Guard, Loop, ScalarProgram
-from jaxgrasp.kernels.program.schedule import Schedule, in_memory
+from jaxgrasp.kernels.program.schedule import Schedule, in_memory, is_computed_in
 
 
 class Body(NamedTuple):
@@ -58,6 +58,8 @@ class VectorCode(ValueCode):
     counters: for every loop of known length, the name of its counter, the block before it, and the line of the phi.
     carried: for every next value of a carried scalar, the loop and the number of the scalar.
     in_slots: next values of carried scalars that were stored in the slots of these.
+    tables: places of tables in the frame.
+    stacked: for every value that a round writes to tables, the loop and the tables, with its places there.
     conjunctions: names of the masks that `conjoin` wrote.
     main_loop: the program's main loop, if it has one.
     lane_state: see `Body`.
@@ -73,6 +75,8 @@ class VectorCode(ValueCode):
         self.counters: dict[Loop, tuple[str, str, int]] = {}
         self.carried: dict[Value, tuple[Loop, int]] = {}
         self.in_slots: set[Value] = set()
+        self.tables: dict[Table, str] = {}
+        self.stacked: dict[Value, tuple[Loop, list[Address]]] = {}
         self.conjunctions: dict[tuple[str, Value], str] = {}
         self.main_loop: Loop | None = None
         self.lane_state: dict[int, str] = {}
@@ -141,6 +145,7 @@ class VectorCode(ValueCode):
         carried = self.carried.get(value)
         if carried is None:
             self.registers.put(value, self.instruction(value))
+            self.stack(value)
             return
         (loop, index), place = carried, None
         mask, old = self.masks.get(loop), loop.carries[index]
@@ -154,6 +159,30 @@ class VectorCode(ValueCode):
             self.store_where(mask, name, place, value.kind)
             self.in_slots.add(value)
         self.registers.put(value, name, place)
+        self.stack(value)
+
+    def stack(self, value: Value) -> None:
+        """Store a value in the tables that a round writes it to, if there are any."""
+        loop, places = self.stacked.get(value, (None, ()))
+        if loop is None:
+            return
+        for address in places:
+            kind = address.table.kind
+            self.store(kind, self.operand(value, kind), self.place_in_table(address))
+
+    def add_table(self, table: Table) -> None:
+        """Allocate a table; what is left of its last line of the cache is zero."""
+        self.tables[table] = self.allocate(table.kind, table.size)
+        for place in range(table.size, self.room(table)):
+            self.store(table.kind, "zeroinitializer", self.place_in_table(Address(table, place)))
+
+    def room(self, table: Table) -> int:
+        """Count the entries of a table, to the end of its last line of the cache."""
+        return -(-table.size * self.stride(table.kind) // 64) * 64 // self.stride(table.kind)
+
+    def place_in_table(self, address: Address) -> str:
+        """Write a pointer to an entry of a table."""
+        return self.place(address, self.memory_types[address.table.kind], self.tables[address.table])
 
     def conjoin(self, mask: str, condition: Any) -> str:
         """Return the mask of lanes where a mask and a condition hold; it is written once."""
@@ -169,8 +198,17 @@ class VectorCode(ValueCode):
         for slot, value, kind in zip(slots, loop.initial, loop.kinds, strict=True):
             self.store(kind, self.operand(value, kind), slot)
         for index, value in enumerate(loop.outputs):
-            if type(value) is Value and value.region is loop.body and not in_memory(value):
+            if type(value) is Value and is_computed_in(value, loop.body):
                 self.carried.setdefault(value, (loop, index))
+        for table, entries in loop.filled:
+            self.add_table(table)
+            for place, value in enumerate(entries):
+                self.store(table.kind, self.operand(value, table.kind), self.place_in_table(Address(table, place)))
+        for table, values in loop.stacked:
+            self.add_table(table)
+            for place, value in enumerate(values):
+                address = Address(table, place, loop.counter, len(values))
+                self.stacked.setdefault(value, (loop, []))[1].append(address)
         self.registers.flush(number)
         if loop is self.main_loop:
             self.lane_state = self.collect_lane_state(number)
@@ -197,6 +235,10 @@ class VectorCode(ValueCode):
                 moved.append((self.operand(value, kind), slot, kind))
         for name, slot, kind in moved:
             self.store_where(self.masks.get(loop), name, slot, kind)
+        for value in dict.fromkeys(x for _, values in loop.stacked for x in values):
+            if not is_computed_in(value, loop.body):
+                self.stack(value)
+            del self.stacked[value]
         self.registers.flush(number)
         head, _, after = self.labels[loop]
         if loop.rounds is None:
@@ -257,9 +299,14 @@ class VectorCode(ValueCode):
             for value in event.uses:
                 if value.op == "own":
                     at = value.address
-                    entries = [at.offset] if at.counter is None else range(self.sizes[at.buffer])
+                    entries = [at.offset] if at.counter is None else range(self.sizes[at.argument])
                     for entry in entries:
-                        add(self.own[at.buffer], value.kind, entry)
+                        add(self.own[at.argument], value.kind, entry)
+                elif value.op == "entry":
+                    table = value.address.table
+                    if table in self.tables:
+                        for entry in range(self.room(table)):
+                            add(self.tables[table], table.kind, entry)
                 elif value.op == "result":
                     step, index = value.args
                     if step in self.slots:
@@ -294,6 +341,8 @@ class VectorCode(ValueCode):
             return self.load_own(value.kind, value.address)
         if value.op == "shared":
             return self.load_shared(value.kind, value.address)
+        if value.op == "entry":
+            return self.load(value.kind, self.place_in_table(value.address))
         step, index = value.args
         return self.load(value.kind, self.slots[step][index])
 
@@ -305,12 +354,12 @@ class VectorCode(ValueCode):
 
     def load_own(self, kind: str, address: Address) -> str:
         """Load a scalar of an argument that every lane has for itself."""
-        return self.load(kind, self.place(address, self.memory_types[kind], self.own[address.buffer]))
+        return self.load(kind, self.place(address, self.memory_types[kind], self.own[address.argument]))
 
     def load_shared(self, kind: str, address: Address) -> str:
         """Load a scalar of an argument that all lanes share, and copy it to all lanes."""
         unit = {"f": self.scalar, "i": "i32", "b": "i8"}[kind]
-        one = self.emit(f"load {unit}, ptr {self.place(address, unit, self.shared[address.buffer])}")
+        one = self.emit(f"load {unit}, ptr {self.place(address, unit, self.shared[address.argument])}")
         if kind == "b":
             one, unit = self.emit(f"icmp ne i8 {one}, 0"), "i1"
         vector = self.types[kind]

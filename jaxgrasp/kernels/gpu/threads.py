@@ -103,6 +103,8 @@ class ThreadCode(ValueCode):
 
     def begin_loop(self, loop: Loop) -> None:
         """Begin a loop; carried scalars are phis, which `end_loop` completes."""
+        if loop.filled or loop.stacked:
+            raise Unsupported("tables on a GPU")
         initial = [self.operand(x, kind) for x, kind in zip(loop.initial, loop.kinds, strict=True)]
         head = self.label("head")
         self.labels[loop] = (head, self.label("body"), self.label("after"))
@@ -195,7 +197,7 @@ class ThreadCode(ValueCode):
             step, index = value.args
             return self.slots[step][index]
         unit = {"f": self.scalar, "i": "i32", "b": "i8"}[value.kind]
-        place = self.place(value.address, unit, self.own[value.address.buffer])
+        place = self.place(value.address, unit, self.own[value.address.argument])
         found = self.emit(f"load {unit}, ptr addrspace(1) {place}")
         return self.emit(f"icmp ne i8 {found}, 0") if value.kind == "b" else found
 

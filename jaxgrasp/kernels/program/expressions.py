@@ -7,6 +7,7 @@ not change in a loop is computed before it.
 Operations and their `args`; an operand is a `Value` or a NumPy scalar, and the type is that of the result:
 
 - "own", "shared" (Address): a scalar of an argument that every lane has for itself, or that all lanes share.
+- "entry" (Address): a scalar of a table.
 - "carry" (Loop, index): a scalar that a loop carries, at the beginning of a round.
 - "result" (Loop or Guard, index): a scalar that a loop or a guard leaves.
 - "counter" (): the number of the round of the loop in whose body it is, type "u".
@@ -18,7 +19,7 @@ Operations and their `args`; an operand is a `Value` or a NumPy scalar, and the 
 - "select" (condition, a, b): a where the condition holds, else b; the type of a and b.
 - "convert" (a): a number as an integer or an integer as a number, "f" or "i".
 
-The first five are read where they lie, the others are computed.
+The first six are read where they lie, the others are computed.
 """
 
 from collections.abc import Callable
@@ -51,19 +52,46 @@ class Region:
         return self.parent
 
 
-class Address(NamedTuple):
-    """The place of a scalar of an argument: entry `offset + counter * stride` of a row of the argument.
+class Table(NamedTuple):
+    """Scalars in memory that loops reach by their counters: what is written before a loop, or by its rounds.
 
-    buffer: number of the argument.
+    number: tells it from all others of the program.
+    kind: the type of its entries.
+    size: how many entries there are.
+    region: the region in which it is written as a whole.
+    """
+
+    number: int
+    kind: str
+    size: int
+    region: Region
+
+
+class Address(NamedTuple):
+    """The place of a scalar: entry `offset + counter * stride` of a row of an argument, or of a table.
+
+    buffer: number of the argument, or the table.
     offset: number of the entry in the flattened row, where there is no counter or it is zero.
     counter: a loop's counter, or a value of type "u" computed from one; None where the entry is always the same.
     stride: how many entries further one more of the counter is.
     """
 
-    buffer: int
+    buffer: int | Table
     offset: int
     counter: "Value | None" = None
     stride: int = 0
+
+    @property
+    def argument(self) -> int:
+        """The number of the argument."""
+        assert isinstance(self.buffer, int)
+        return self.buffer
+
+    @property
+    def table(self) -> Table:
+        """The table."""
+        assert isinstance(self.buffer, Table)
+        return self.buffer
 
 
 @final
@@ -88,7 +116,7 @@ class Value:
 
     @property
     def address(self) -> Address:
-        """The place of the scalar; only "own" and "shared" have an address."""
+        """The place of the scalar; only "own", "shared" and "entry" have an address."""
         return self.args[0]
 
 
@@ -185,10 +213,10 @@ class Builder:
         """Find the outermost region that knows all operands."""
         home, region = None, self.region
         for x in args:
-            # An address may depend on a counter, and then belongs to its loop.
-            x = x.counter if isinstance(x, Address) else x
-            if type(x) is Value and (home is None or x.region.depth > home.depth):
-                home = x.region
+            # An address may depend on a counter, and then belongs to its loop; else it does to the table's region.
+            inside = x.region if type(x) is Value else _region_of(x) if isinstance(x, Address) else None
+            if inside is not None and (home is None or inside.depth > home.depth):
+                home = inside
         # The outermost region is the kernel's; guarded ones keep what is made in them.
         while region is not None:
             if region is home or region.guarded or region.parent is None:
@@ -202,6 +230,13 @@ class Builder:
         if op == "rsqrt":
             return (1 / np.sqrt(args[0])).astype(args[0].dtype)
         return _FOLD[op](*args)
+
+
+def _region_of(address: Address) -> Region | None:
+    """Find the region in which an address means something; None where it does anywhere."""
+    if address.counter is not None:
+        return address.counter.region
+    return address.buffer.region if isinstance(address.buffer, Table) else None
 
 
 def _simplify_product(builder: Builder, a: Any, b: Any) -> Any:

@@ -12,8 +12,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxgrasp.kernels.program.entries import array, aval_of, common_kind, fold_constants, objects
-from jaxgrasp.kernels.program.expressions import Address, Builder, Region, Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.expressions import Address, Builder, Region, Table, Unsupported, Value, kind_of
 from jaxgrasp.kernels.program.rules import ELEMENTWISE, RULES
+from jaxgrasp.kernels.program.tables import sliced, stacked
 from jaxgrasp.kernels.program.unrolling import MOST_ENTRIES, entries_of, may_unroll
 
 # The type of the operands of operations that have instructions for one type alone.
@@ -34,6 +35,8 @@ class Loop:
     counter: the number of the round, a value of type "u" in `body`; None where `rounds` is.
     outputs: the carried scalars at the end of a round.
     results: the carried scalars after the last round, values of the region around the loop.
+    filled: tables that are written before the first round, with their entries.
+    stacked: tables that rounds write, with the scalars that each round writes behind those of the one before.
     """
 
     body: Region
@@ -45,6 +48,8 @@ class Loop:
     counter: Value | None = None
     outputs: list[Any] = field(default_factory=list)
     results: list[Value] = field(default_factory=list)
+    filled: list[tuple[Table, list[Any]]] = field(default_factory=list)
+    stacked: list[tuple[Table, list[Value]]] = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -114,10 +119,18 @@ def lower(jaxpr: ClosedJaxpr, shared: list[bool]) -> ScalarProgram:
 
 
 class _Lowering:
-    """Evaluates jaxprs with arrays of scalars; rules use its methods."""
+    """Evaluates jaxprs with arrays of scalars; rules use its methods.
+
+    loops: those that are being written, by the regions of their bodies.
+    tables: those that were filled, by where they are and what is in them, see `tables`.
+    count: how many tables there are.
+    """
 
     def __init__(self, builder: Builder) -> None:
         self.builder = builder
+        self.loops: dict[Region, Loop] = {}
+        self.tables: dict[Any, Table] = {}
+        self.count = 0
 
     def run(self, jaxpr: Jaxpr, consts: list[np.ndarray], args: list[np.ndarray]) -> list[np.ndarray]:
         """Evaluate a jaxpr; return its results."""
@@ -175,14 +188,13 @@ class _Lowering:
         n_consts, n_carry = params["num_consts"], params["num_carry"]
         consts, carry, xs = args[:n_consts], args[n_consts : n_consts + n_carry], args[n_consts + n_carry :]
         inner = [np.asarray(c) for c in body.consts]
-        n_ys = len(body.jaxpr.outvars) - n_carry
         # Integers that only count rounds are not carried: they are the loop's counter and where they start.
         counters = _counters(body.jaxpr, n_consts, n_carry, carry)
         counted = xs or any(used for _, used in counters.values())
         if may_unroll(params, bool(counted)):
             return self.unroll(params, consts, carry, xs)
-        if n_ys or reverse:
-            raise Unsupported("a long loop with stacked results")
+        if reverse:
+            raise Unsupported("a long loop from the end")
         region = Region(self.builder.region)
         counter = Value("counter", (), "u", region)
         base = {i: carry[i] for i in counters}
@@ -196,11 +208,13 @@ class _Lowering:
             else next(carried)
             for i in range(n_carry)
         ]
-        rows_now = [self.entry(x, counter) for x in xs]
+        rows_now = [sliced(self, x, (counter, *[0] * (x.ndim - 1)), (1, *x.shape[1:]))[0] for x in xs]
         out = self.run(body.jaxpr, inner, [*consts, *start, *rows_now])
-        results = iter(self.close_loop(loop, [x for i, x in enumerate(out) if i not in counters], inits))
+        left = [x for i, x in enumerate(out[:n_carry]) if i not in counters]
+        results = iter(self.close_loop(loop, left, inits))
         last = lambda i: np.asarray(base[i] + length, base[i].dtype)
-        return [last(i) if i in counters else next(results) for i in range(n_carry)]
+        carried_out = [last(i) if i in counters else next(results) for i in range(n_carry)]
+        return [*carried_out, *[stacked(self, loop, length, y) for y in out[n_carry:]]]
 
     def unroll(
         self, params: dict, consts: list[np.ndarray], carry: list[np.ndarray], xs: list[np.ndarray]
@@ -236,7 +250,7 @@ class _Lowering:
                 loop.carries.append(inside[-1])
                 loop.kinds.append(kind)
             values.append(array(inside, x.shape))
-        self.builder.region = region
+        self.builder.region, self.loops[region] = region, loop
         return loop, values
 
     def close_loop(self, loop: Loop, outputs: list[np.ndarray], like: list[np.ndarray]) -> list[np.ndarray]:
@@ -247,10 +261,6 @@ class _Lowering:
         loop.results = [Value("result", (loop, i), kind, region) for i, kind in enumerate(loop.kinds)]
         results = iter(loop.results)
         return [array([next(results) for _ in range(x.size)], x.shape) for x in like]
-
-    def entry(self, x: np.ndarray, at: Value) -> np.ndarray:
-        """Return x[at] for a counter."""
-        return self.dynamic(x, (at, *[0] * (x.ndim - 1)), (1, *x.shape[1:]))[0]
 
     def while_loop(self, params: dict, args: list[np.ndarray]) -> list[np.ndarray]:
         """Lower a loop that goes on as long as the condition of any lane holds."""
@@ -311,46 +321,6 @@ class _Lowering:
             pairs = zip(objects(these).ravel(), objects(those).ravel(), strict=True)
             out.append(array([make("select", taken, a, b) for a, b in pairs], these.shape))
         return out
-
-    def dynamic(self, x: np.ndarray, starts: tuple, sizes: tuple[int, ...]) -> np.ndarray:
-        """Slice an array at starts of which at most one is a counter; known starts are clamped as XLA clamps them.
-
-        Raises:
-            Unsupported: more than one start is computed, a start is not a counter, or see `stride`.
-        """
-        if all(type(s) is not Value for s in starts):
-            corner = [min(max(int(s), 0), n - k) for s, n, k in zip(starts, x.shape, sizes, strict=True)]
-            return x[tuple(slice(c, c + k) for c, k in zip(corner, sizes, strict=True))]
-        moving = [axis for axis, s in enumerate(starts) if type(s) is Value]
-        (axis,) = moving if len(moving) == 1 else (None,)
-        if axis is None or starts[axis].kind != "u":
-            raise Unsupported("an index that differs between lanes")
-        fixed = [
-            0 if a == axis else min(max(int(s), 0), n - k)
-            for a, (s, n, k) in enumerate(zip(starts, x.shape, sizes, strict=True))
-        ]
-        first = x[tuple(slice(c, c + k) for c, k in zip(fixed, sizes, strict=True))]
-        stride = self.stride(x, axis)
-        out = []
-        for v in first.ravel():
-            moving = v.address._replace(counter=starts[axis], stride=stride)
-            out.append(self.builder.value(v.op, (moving,), v.kind))
-        return array(out, first.shape)
-
-    def stride(self, x: np.ndarray, axis: int) -> int:
-        """Return how many entries of an argument apart the entries of an array lie along an axis.
-
-        Raises:
-            Unsupported: the entries do not lie at equal distances in one argument, at addresses without a counter.
-        """
-        flat = np.moveaxis(objects(x), axis, 0).reshape(x.shape[axis], -1)
-        if all(type(v) is Value and v.op in ("own", "shared") and v.address.counter is None for v in flat.flat):
-            offsets = np.array([v.address.offset for v in flat.flat]).reshape(flat.shape)
-            steps = np.diff(offsets, axis=0)
-            buffers = {(v.op, v.address.buffer) for v in flat.flat}
-            if len(buffers) == 1 and (not steps.size or (steps == steps.flat[0]).all()):
-                return int(steps.flat[0]) if steps.size else 0
-        raise Unsupported("a long loop over computed arrays")
 
 
 def _counters(body: Jaxpr, n_consts: int, n_carry: int, carry: list[np.ndarray]) -> dict[int, tuple[int, bool]]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxgrasp.kernels.program.entries import array, common_kind, fold_constants, kind_of_scalar, like, objects
 from jaxgrasp.kernels.program.expressions import Unsupported, Value, kind_of
+from jaxgrasp.kernels.program.tables import sliced
 
 # Operations entry by entry, by the name that JAX gives them.
 ELEMENTWISE = {
@@ -198,7 +199,7 @@ def _iota(lower: Any, params: dict, aval: Any) -> np.ndarray:
 
 
 def _dynamic_slice(lower: Any, params: dict, aval: Any, x: np.ndarray, *starts: np.ndarray) -> np.ndarray:
-    return lower.dynamic(x, tuple(s.item() for s in starts), tuple(params["slice_sizes"]))
+    return sliced(lower, x, tuple(s.item() for s in starts), tuple(params["slice_sizes"]))
 
 
 def _dynamic_update(

@@ -49,7 +49,12 @@ class Schedule:
 
 def in_memory(value: Value) -> bool:
     """Tell whether a value is not computed, but read from memory wherever it is used."""
-    return value.op in ("own", "shared", "carry", "result")
+    return value.op in ("own", "shared", "entry", "carry", "result")
+
+
+def is_computed_in(value: Value, region: Region) -> bool:
+    """Tell whether a region computes a value."""
+    return value.region is region and not in_memory(value) and value.op != "counter"
 
 
 def schedule(program: ScalarProgram) -> Schedule:
@@ -112,7 +117,7 @@ def _interleave(events: list[Event]) -> list[Event]:
 
 def operands(value: Value, fused: set[Value]) -> list[Value]:
     """Return what has to be known to compute a value: its operands, and the counters of their addresses."""
-    if value.op in ("own", "shared"):
+    if value.op in ("own", "shared", "entry"):
         return _values([value.address.counter])
     if value.op in ("carry", "result", "counter"):
         return []
@@ -129,7 +134,7 @@ def operands(value: Value, fused: set[Value]) -> list[Value]:
 
 def _with_counters(values: list[Value]) -> list[Value]:
     """Append the counters that the addresses of values in memory depend on."""
-    far = [x.address.counter for x in values if x.op in ("own", "shared")]
+    far = [x.address.counter for x in values if x.op in ("own", "shared", "entry")]
     return values + _values(far) if far else values
 
 
@@ -140,8 +145,19 @@ def _values(entries: Iterable[Any]) -> list[Value]:
 
 def _roots(step: Step) -> list[Any]:
     """Return what a step needs: to begin, to be tested, and of its body."""
-    entered = [*step.initial, step.condition] if isinstance(step, Loop) else [step.condition]
-    return [*entered, *step.outputs]
+    if isinstance(step, Guard):
+        return [step.condition, *step.outputs]
+    return [*_entered(step), step.condition, *step.outputs, *_stacked(step)]
+
+
+def _entered(loop: Loop) -> list[Any]:
+    """Return what a loop begins with: carried scalars, and what its tables are filled with."""
+    return [*loop.initial, *[x for _, entries in loop.filled for x in entries]]
+
+
+def _stacked(loop: Loop) -> list[Value]:
+    """Return what every round of a loop writes to tables."""
+    return [x for _, entries in loop.stacked for x in entries]
 
 
 def _collect_used(region: Region, results: list[Any]) -> tuple[list[Value], Counter[Value]]:
@@ -212,13 +228,16 @@ class _Order:
             self.compute_all([step.condition])
             self.events.append(Event("enter", step, _values([step.condition])))
         else:
-            self.compute_all(step.initial)
-            self.events.append(Event("enter", step, _values(step.initial)))
+            self.compute_all(_entered(step))
+            self.events.append(Event("enter", step, _values(_entered(step))))
             if step.rounds is None:
                 self.compute_all([step.condition])
                 self.events.append(Event("test", step, _values([step.condition])))
-        self.region(body, step.outputs)
-        self.events.append(Event("leave", step, _values(step.outputs)))
+        written = _stacked(step) if isinstance(step, Loop) else []
+        self.region(body, [*step.outputs, *written])
+        # What the body computes is written where it is computed.
+        rest = [x for x in written if not is_computed_in(x, body)]
+        self.events.append(Event("leave", step, [*_values(step.outputs), *rest]))
 
     def compute_all(self, entries: Iterable[Any]) -> None:
         """Add scalars that are not there yet."""
@@ -284,3 +303,7 @@ def _record_uses(schedule: Schedule) -> None:
             schedule.last[value] = max(schedule.last.get(value, -1), last)
         if event.what == "enter":
             inside.append((event.subject, number))
+    for number, event in enumerate(schedule.events):
+        if event.what == "compute":
+            # What a round writes to a table may be used by nobody else.
+            schedule.last.setdefault(event.subject, number)

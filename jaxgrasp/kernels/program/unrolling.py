@@ -13,7 +13,9 @@ _SHORT, _COUNTED, _STACKED = 2, 16, 64
 # gains nothing by knowing the counter, and compiles for as long as there are rounds.
 _MOST_UNROLLED = 1 << 13
 # The most entries of all arrays in a kernel, of which a third to a half are operations; more would compile for minutes.
-MOST_ENTRIES = 600_000
+MOST_ENTRIES = 700_000
+STAYS = "in_turn"
+"""The name of a function that is the body of a loop which is not written out, see `lanes.fence.in_turn`."""
 
 
 def entries_of(jaxpr: Jaxpr) -> int:
@@ -26,9 +28,16 @@ def entries_of(jaxpr: Jaxpr) -> int:
     return total
 
 
+def stays(body: Jaxpr) -> bool:
+    """Tell whether a loop shall stay one, however short: its body is nothing but a call of a function named `STAYS`."""
+    return len(body.eqns) == 1 and body.eqns[0].params.get("name") == STAYS
+
+
 def may_unroll(params: dict, counted: bool = True) -> bool:
     """Tell whether the rounds of a scan are written one after the other, where its body reads its counter or not."""
     body, length = params["jaxpr"], params["length"]
+    if stays(body.jaxpr):
+        return False
     stacks = len(body.jaxpr.outvars) > params["num_carry"]
     if length <= _SHORT or (stacks and length <= _STACKED):
         return True
