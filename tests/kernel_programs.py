@@ -127,6 +127,15 @@ def actuation(dtype):
     return jg.Actuation.from_jacobian(*(jnp.asarray(x, dtype) for x in (jacobian, np.eye(7)[:, :5], -limits, limits)))
 
 
+def whole_hand(dtype):
+    """An actuator drives two joints, dry friction acts on all: efforts for all directions."""
+    rng = np.random.default_rng(4)
+    jacobian = 0.05 * rng.normal(size=(LANES, 3, 3, 7))
+    transmission = np.concatenate([np.eye(7)[:, :5] + np.eye(7, 5, -2), np.eye(7)], 1)
+    limits = np.repeat([0.6, 0.02], [5, 7])
+    return jg.Actuation.from_jacobian(*(jnp.asarray(x, dtype) for x in (jacobian, transmission, -limits, limits)))
+
+
 def gradient(dtype, of: Callable, field: str, n_c=3, power=1, **options):
     """With respect to positions, friction and the bounds on forces."""
     options = {"families": PLAIN, **options}
@@ -185,6 +194,10 @@ GROUPS: dict[str, dict[str, Program]] = {
         "full weights": partial(effort, effort_weights=blocks(LANES, 9, 9)),
         "actuators": partial(margin, actuation=actuation),
         "effort, actuators": partial(effort, actuation=actuation),
+    },
+    "hands": {
+        "margin": partial(margin, actuation=whole_hand),
+        "effort": partial(effort, actuation=whole_hand),
     },
     "chain": {
         name: partial(formulation, name=name)

@@ -33,6 +33,10 @@ class Basis(NamedTuple):
         """Compute T w for w (r, *lanes): its coordinates in the basis; in dropped rows, its part outside the range."""
         return fold(jnp.add, [self.operations[:, c] * wrench[c] for c in range(wrench.shape[0])])
 
+    def multipliers(self, y: jax.Array) -> jax.Array:
+        """Compute T'y (r, *lanes): the multipliers of the original rows that belong to those of the basis."""
+        return fold(jnp.add, [row * k for row, k in zip(self.operations, self.kept * y, strict=True)])
+
 
 def row_basis(rows: jax.Array) -> Basis:
     """Make rows (r, k, n, *lanes) orthonormal by modified Gram-Schmidt.

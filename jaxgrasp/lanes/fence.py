@@ -15,7 +15,10 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from jaxgrasp.kernels.program.unrolling import STAYS
+
 P = ParamSpec("P")
+S = TypeVar("S")
 T = TypeVar("T")
 U = TypeVar("U")
 
@@ -44,6 +47,11 @@ def loops() -> Iterator[None]:
         _loops.reset(tokens[1])
 
 
+def in_loops() -> bool:
+    """Tell whether what is traced keeps its loops, see `loops`."""
+    return _loops.get()
+
+
 def fenced(function: Callable[P, T]) -> Callable[P, T]:
     """Compute the results of `function` exactly once, where fences are on. Arguments must be trees of arrays."""
 
@@ -68,6 +76,22 @@ def repeat(count: int, step: Callable[[jax.Array, T], T], state: T) -> T:
     if count == 1:
         return step(jnp.asarray(0), state)
     return jax.lax.fori_loop(0, count, step, state, unroll=None if _fences.get() or _loops.get() else True)
+
+
+def in_turn(step: Callable[[S, T], tuple[S, U]], state: S, parts: T) -> tuple[S, U]:
+    """Go through parts as `lax.scan`, in a loop that kernels do not write out, though it is short.
+
+    For what is done many times over, where code that is written out would compile for too long. For XLA the parts are
+    worked on at once where there is no state, None.
+    """
+    if state is None and not in_loops():
+        return state, jax.vmap(lambda part: step(state, part)[1])(parts)
+
+    def in_turn(state: S, part: T) -> tuple[S, U]:
+        return step(state, part)
+
+    assert in_turn.__name__ == STAYS
+    return jax.lax.scan(jax.jit(in_turn), state, parts)
 
 
 def each(function: Callable[[T], U], parts: T) -> U:

@@ -12,7 +12,6 @@ from jax import lax
 from jaxgrasp import linalg
 from jaxgrasp.arrays import fold
 from jaxgrasp.compiling import compiled
-from jaxgrasp.contact.actuation import Actuation
 from jaxgrasp.contact.compliance import Compliance, inverse_root, is_full
 from jaxgrasp.contact.contacts import Contacts, rotations
 from jaxgrasp.contact.grasp_map import grasp_columns
@@ -21,7 +20,7 @@ from jaxgrasp.kernels import usable
 from jaxgrasp.lanes.differentiable import BatchedFunction, Lanes, differentiable
 from jaxgrasp.lanes.direct import cut
 from jaxgrasp.lanes.tiles import LOOSE_TILE, TILE
-from jaxgrasp.robustness.actuators import Actuated, clip_limits, stack_rows
+from jaxgrasp.robustness.actuators import Actuated, admit_actuation, clip_limits, stack_rows, usable_actuation
 from jaxgrasp.robustness.auditing import audited
 from jaxgrasp.robustness.interface.arguments import Arguments, GraspData, Inputs, Options, lay_out
 from jaxgrasp.robustness.interface.sizes import fill_to_known_size
@@ -185,7 +184,7 @@ def admit(inputs: Inputs) -> Grasps:
     for extent in inputs.extents:
         valid &= (jnp.isfinite(extent) & (extent >= 0)).all(0)
     if data.actuation is not None:
-        valid &= _usable_actuation(data.actuation, active)
+        valid &= usable_actuation(data.actuation, active)
     options, valid = _admit_options(inputs.options, valid)
 
     # A choice of units: nothing that is reported in newtons and metres depends on it.
@@ -204,7 +203,7 @@ def admit(inputs: Inputs) -> Grasps:
         arms = jnp.where(present, arms, 0) / length
     actuated = None
     if data.actuation is not None:
-        actuated = _admit_actuation(data.actuation, transmits & valid, valid, length)
+        actuated = admit_actuation(data.actuation, transmits & valid, valid, length)
         actuated = clip_limits(actuated, friction, jnp.where(present, max_force, 0))
     return Grasps(
         valid=valid,
@@ -334,32 +333,6 @@ def _length(
     for moment in (wrench, *extents):
         usable &= jnp.isfinite(lax.stop_gradient(moment[3:]) / length).all(0)
     return length, usable
-
-
-def _usable_actuation(actuation: Actuation, active: jax.Array) -> jax.Array:
-    """Whether everything that is used is finite, and no limits cross, (*lanes)."""
-    # A sum is finite where all of its terms are. Spelt out: large reductions are library calls.
-    total = lambda x: fold(jnp.add, fold(jnp.add, jnp.abs(x)))
-    usable = (jnp.isfinite(total(jnp.moveaxis(actuation.jacobian, 0, 2))) | ~active).all(0)
-    for matrix in (actuation.inverse, actuation.transmission, actuation.unreached):
-        if matrix is not None:
-            usable &= jnp.isfinite(total(matrix))
-    lower, upper = actuation.lower, actuation.upper
-    return usable & ((lower <= upper) & (lower < jnp.inf) & (upper > -jnp.inf)).all(0)
-
-
-def _admit_actuation(actuation: Actuation, transmits: jax.Array, valid: jax.Array, length: jax.Array) -> Actuated:
-    """The actuation in units of the length, harmless in lanes that are not valid."""
-    jacobian = jnp.where(transmits[:, :, None], actuation.jacobian, 0)
-    safe = lambda matrix: jnp.where(valid, matrix, 0)
-    return Actuated(
-        joints=jnp.moveaxis(jacobian, (2, 1, 0), (0, 1, 2)) / length,
-        transmission=safe(actuation.transmission) / length,
-        inverse=safe(actuation.inverse) * length,
-        unreached=jax.tree.map(safe, actuation.unreached),
-        lower=jnp.where(valid, actuation.lower, -1),
-        upper=jnp.where(valid, actuation.upper, 1),
-    )
 
 
 def _masked(matrices: jax.Array | None, transmits: jax.Array) -> jax.Array | None:

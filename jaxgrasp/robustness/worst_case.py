@@ -24,7 +24,7 @@ from jaxgrasp.disturbance.sets import furthest, support
 from jaxgrasp.disturbance.terms import Term
 from jaxgrasp.disturbance.vertices import wrenches_of
 from jaxgrasp.lanes.differentiable import OfPyramids, Plain
-from jaxgrasp.lanes.fence import each, fenced
+from jaxgrasp.lanes.fence import each, fenced, in_turn
 from jaxgrasp.robustness.actuators import actuator_reach
 from jaxgrasp.robustness.grasps import Grasps, over_grasps
 from jaxgrasp.robustness.interface.arguments import GraspData
@@ -88,8 +88,17 @@ def worst_rows(grasps: Grasps, cone_edges: int) -> RowLosses:
     inverse, basis = pseudo_inverse(grasps.rows, grasps.inverse_root)
     actuators = None
     if grasps.vertex_inverse_roots is None:
-        reach = fenced(support)(grasps.terms, _directions(inverse, grasps.friction, grasps.units, cone_edges))
-        if grasps.actuated is not None:
+        if grasps.actuated is None:
+            reach = fenced(support)(grasps.terms, _directions(inverse, grasps.friction, grasps.units, cone_edges))
+        else:
+            # Programs of hands are large as they are: contact by contact.
+            def of_contact(_: None, contact: tuple) -> tuple[None, jax.Array]:
+                inverse, friction = contact
+                rows = _directions(inverse[:, :, None], friction[None], grasps.units, cone_edges)
+                return None, support(grasps.terms, rows[:, :, 0])
+
+            contacts = jnp.moveaxis(inverse, 2, 0), grasps.friction
+            reach = jnp.moveaxis(in_turn(of_contact, None, contacts)[1], 0, 1)
             actuators = fenced(support)(grasps.terms, actuator_reach(grasps.actuated, inverse[:, :6], grasps.units))
     else:
 

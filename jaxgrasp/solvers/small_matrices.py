@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxgrasp.arrays import fold
@@ -146,6 +147,60 @@ def orthonormalise(matrix: jax.Array) -> jax.Array:
 
     both = jnp.concatenate([matrix, jnp.broadcast_to(eye, (size, *matrix.shape[1:]))])
     return repeat(size, remove, both)[rows:]
+
+
+class ColumnFactor(NamedTuple):
+    """The Cholesky factor L of matrices (r, r, *lanes), by columns, whose size is that of the code as well."""
+
+    below: list[jax.Array]  # the entries of column j below the diagonal, (r - 1 - j, *lanes), of all but the last one
+    inverse: list[jax.Array]  # 1 / diag(L), (*lanes) each
+
+    def remainders(self, rhs: jax.Array) -> jax.Array:
+        """Compute diag(L) L^-1 rhs for rhs (r, *lanes): what the columns before leave of every entry."""
+        out = []
+        for below, inverse in zip(self.below, self.inverse[:-1], strict=True):
+            out.append(rhs[0])
+            rhs = rhs[1:] - below * (rhs[0] * inverse)
+        return jnp.stack([*out, rhs[0]])
+
+    def down(self, rhs: jax.Array) -> jax.Array:
+        """Compute L^-1 rhs for rhs (r, *lanes)."""
+        return self.remainders(rhs) * jnp.stack(self.inverse)
+
+    def up(self, rhs: jax.Array) -> jax.Array:
+        """Compute L^-T rhs for rhs (r, *lanes)."""
+        out = (rhs[-1] * self.inverse[-1])[None]
+        for j in reversed(range(len(rhs) - 1)):
+            entry = (rhs[j] - fold(jnp.add, self.below[j] * out)) * self.inverse[j]
+            out = jnp.concatenate([entry[None], out])
+        return out
+
+
+def cholesky_by_columns(matrix: jax.Array, dropped: float | None = None) -> ColumnFactor:
+    """Factor symmetric positive definite matrices.
+
+    Args:
+        matrix: (r, r, *lanes).
+        dropped: rows whose pivot is no more than this share of the diagonal are left out: 1 / diag(L) is 0 there. None:
+            pivots are clamped at eps of the diagonal.
+    """
+    share = jnp.finfo(matrix.dtype).eps if dropped is None else dropped
+    least = [share * matrix[j, j] for j in range(len(matrix))]
+    factor = ColumnFactor([], [])
+    for floor in least:
+        root = lax.rsqrt(jnp.maximum(matrix[0, 0], floor))
+        factor.inverse.append(root if dropped is None else jnp.where(matrix[0, 0] > floor, root, 0))
+        if len(matrix) > 1:
+            below = matrix[1:, 0] * factor.inverse[-1]
+            factor.below.append(below)
+            matrix = matrix[1:, 1:] - below[:, None] * below
+    return factor
+
+
+def lower_places(size: int) -> np.ndarray:
+    """Find where the entries of a symmetric matrix stand in its lower triangle, row by row: (size, size)."""
+    rows, columns = np.maximum(*np.indices((size, size))), np.minimum(*np.indices((size, size)))
+    return rows * (rows + 1) // 2 + columns
 
 
 class SmallFactor(NamedTuple):

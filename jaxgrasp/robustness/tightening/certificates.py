@@ -52,7 +52,7 @@ def balance(program: ScaledProgram, problem: BlockProblem, x: Rows) -> Forces:
 
     @fenced
     def move(x: Rows, gap: jax.Array) -> Rows:
-        return tuple(x_g + c for x_g, c in zip(x, problem.pull_back(gap), strict=True))
+        return tuple(x_g + c for x_g, c in zip(x, problem.restore(gap), strict=True))
 
     gap, missed = lacking(x)
     x = move(x, gap)

@@ -24,7 +24,9 @@ def margin_problem(program: ScaledProgram, cutoff: jax.Array | None = None) -> M
     """(21) as a problem for the solver; it gives up margins below the cutoff, in units of the disturbances."""
     refinements = _REFINEMENTS[program.rhs.dtype.name]
     cutoff = None if cutoff is None else cutoff / program.scale
-    return MarginProblem(program.groups, program.rhs, program.dropped, program.radius, refinements, cutoff)
+    return MarginProblem(
+        program.groups, program.rhs, program.dropped, program.radius, refinements, program.joined, cutoff
+    )
 
 
 class ScaledEffort(NamedTuple):
@@ -71,6 +73,7 @@ def effort_problem(grasps: Grasps, program: ScaledProgram, guess: Rows = ()) -> 
         program.dropped,
         program.radius,
         _REFINEMENTS[dtype.name],
+        program.joined,
         guess,
         tuple(curvature_of(g) for g in groups),
     )

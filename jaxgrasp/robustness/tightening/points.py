@@ -96,5 +96,5 @@ def scale_point(
         s.append(jnp.where(group.present > 0, usable(slack, 1), 1))
         stationary = adjoint_rows(group, z_g)
         pull.append(stationary if group.hessian_root is None else stationary + apply_hessian(group, x_g))
-    blocks, y = tuple(x), -problem.equality(tuple(pull))
+    blocks, y = tuple(x), problem.balancing(tuple(pull))
     return Iterate((blocks, lam) if problem.bordered else blocks, y, tuple(s), tuple(z))

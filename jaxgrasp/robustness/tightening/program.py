@@ -19,10 +19,20 @@ from jaxgrasp.arrays import fold, literal
 from jaxgrasp.contact.contacts import LEAST_FRICTION
 from jaxgrasp.contact.friction import contact_facets
 from jaxgrasp.contact.row_space import RANK_TOLERANCE, Basis, whitened
-from jaxgrasp.lanes.fence import fenced
-from jaxgrasp.robustness.actuators import ActuatorRows, actuator_unit, join_rows, pack, unpack
+from jaxgrasp.lanes.fence import fenced, in_loops
+from jaxgrasp.robustness.actuators import (
+    ActuatorRows,
+    HandBasis,
+    JoinedRows,
+    actuator_unit,
+    join_rows,
+    pack,
+    unpack,
+    whiten_efforts,
+)
 from jaxgrasp.robustness.grasps import Grasps
 from jaxgrasp.robustness.worst_case import RowLosses, reach_outside, worst_rows
+from jaxgrasp.solvers.block.joined import Joined
 from jaxgrasp.solvers.block.kkt import Blocks, Record, Rows, total
 from jaxgrasp.solvers.interior_point import Iterate
 
@@ -77,7 +87,7 @@ class ScaledProgram:
     """F, (n, *lanes), N."""
     original: Equalities
     """The equality rows before `columns` were made of them."""
-    basis: Basis
+    basis: Basis | HandBasis
     """Row operations from the rows in newtons to the orthonormal ones, for forces in units of `mean`."""
     mean: jax.Array
     """Mean of F, (*lanes), N."""
@@ -97,6 +107,11 @@ class ScaledProgram:
     """What the actuators add; None where there are none."""
     joint_sizes: jax.Array | None
     """(n_v, *lanes), what the rows of J'f - B u were divided by; None without actuators."""
+
+    @property
+    def joined(self) -> Joined | None:
+        """How the rows of J'f - B u are joined to those of G; None where all rows are orthonormal."""
+        return Joined(6) if isinstance(self.basis, HandBasis) else None
 
     @property
     def groups(self) -> tuple[Blocks, ...]:
@@ -151,11 +166,11 @@ class ScaledProgram:
 
     def row_multipliers(self, y: jax.Array) -> jax.Array:
         """T'y, (eq, *lanes): the multipliers of the original rows that belong to those of the orthonormal ones."""
-        kept = self.basis.kept * y
-        return fold(jnp.add, [row * k for row, k in zip(self.basis.operations, kept, strict=True)])
+        return self.basis.multipliers(y)
 
     def wrench_multipliers_adjoint(self, y: jax.Array, units: jax.Array) -> jax.Array:
         """The transpose of `wrench_multipliers`."""
+        assert isinstance(self.basis, Basis)
         y = y * units / self.mean
         return fold(jnp.add, [self.basis.operations[:, c] * y[c] for c in range(6)]) * self.basis.kept
 
@@ -194,6 +209,7 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
     tolerance = 10 * RANK_TOLERANCE[dtype.name]
     wrench_outside = fold(jnp.maximum, jnp.abs(coordinates) * (1 - kept)) > tolerance * largest
     reach = reach_outside(grasps, losses.basis)
+    doubtful = _doubtful(grasps, losses.basis, reach, tolerance)
     return ScaledProgram(
         cone_edges=cone_edges,
         columns=equalities.forces,
@@ -212,7 +228,7 @@ def scale_program(grasps: Grasps, cone_edges: int) -> ScaledProgram:
         mean=mean,
         rank=fold(jnp.add, losses.basis.kept[:6]).astype(jnp.int32),
         least_ratio=fold(jnp.minimum, jnp.where(losses.basis.kept > 0, losses.basis.ratios, 1)[:6]),
-        doubtful=_doubtful(grasps, losses.basis, reach, tolerance),
+        doubtful=doubtful if equalities.doubtful is None else doubtful | equalities.doubtful,
         undisturbed=rows.undisturbed,
         disturbance_outside=reach > tolerance,
         wrench_outside=wrench_outside,
@@ -281,19 +297,23 @@ class _ScaledEqualities(NamedTuple):
     joint_sizes: (n_v, *lanes), what the rows of J'f - B u were divided by; None without actuators.
     basis: row operations from the original rows to the orthonormal ones.
     original: the rows before.
+    doubtful: bool (*lanes), whether efforts answer all forces is in doubt; None where that does not matter.
     """
 
     forces: jax.Array
     actuators: jax.Array | None
     joint_sizes: jax.Array | None
-    basis: Basis
+    basis: Basis | HandBasis
     original: Equalities
+    doubtful: jax.Array | None = None
 
 
 def _scale_equalities(
     grasps: Grasps, scales: jax.Array, wrench: jax.Array, unit: jax.Array | None
 ) -> _ScaledEqualities:
-    """Make the rows of G f = b, and of J'f - B u = 0, orthonormal.
+    """Make the rows of G f = b orthonormal, and those of J'f - B u = 0.
+
+    For kernels these are kept apart where efforts reach all joints: one step then takes a fifth of the operations.
 
     Args:
         grasps: the grasps.
@@ -306,11 +326,28 @@ def _scale_equalities(
         basis = whitened(columns[0])
         return _ScaledEqualities(basis.rows, None, None, basis, Equalities(columns, wrench))
     joined = join_rows(grasps.actuated, grasps.columns * scales, scales, unit)
+    if in_loops() and grasps.actuated.unreached is None:
+        return _joint_rows_apart(joined, wrench)
     basis = whitened(pack(joined))
     forces, actuators = unpack(basis.rows, grasps.present.shape[0], unit.shape[0])
     wrench = jnp.concatenate([wrench, jnp.zeros_like(joined.sizes)])
     original = Equalities((joined.forces, joined.actuators), wrench)
     return _ScaledEqualities(forces, actuators, joined.sizes, basis, original)
+
+
+def _joint_rows_apart(rows: JoinedRows, wrench: jax.Array) -> _ScaledEqualities:
+    """Make the rows of G f = b orthonormal, and those of J'f - B u = 0 so that B has orthonormal rows."""
+    wrenches, hand = whitened(rows.forces[:6]), whiten_efforts(rows)
+    kept = jnp.concatenate([wrenches.kept, hand.kept])
+    original = Equalities((rows.forces, rows.actuators), jnp.concatenate([wrench, jnp.zeros_like(rows.sizes)]))
+    return _ScaledEqualities(
+        forces=jnp.concatenate([wrenches.rows, hand.forces]),
+        actuators=jnp.concatenate([rows.actuators[:6], hand.actuators[:, None]]),
+        joint_sizes=rows.sizes,
+        basis=HandBasis(wrenches, hand.factor, kept),
+        original=original,
+        doubtful=hand.lost > 10 * RANK_TOLERANCE[wrench.dtype.name],
+    )
 
 
 def prepare(grasps: Grasps, cone_edges: int) -> tuple[Grasps, ScaledProgram]:

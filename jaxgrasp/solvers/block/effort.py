@@ -51,7 +51,7 @@ class EffortProblem(BlockProblem):
         pull = tuple(
             apply_hessian(g, x) + adjoint_rows(g, z_g) for g, x, z_g in zip(self.groups, blocks, z, strict=True)
         )
-        return Iterate(blocks, -self.equality(pull), s, z)
+        return Iterate(blocks, self.balancing(pull), s, z)
 
     def residuals(self, iterate: Iterate) -> Residuals:
         """Compute the residuals of stationarity, of E x = b and of the rows."""

@@ -48,8 +48,11 @@ import jax.numpy as jnp
 from jaxgrasp.arrays import fold
 from jaxgrasp.lanes.fence import each, fenced
 from jaxgrasp.solvers.block.factors import BlockFactor, Factor, couple, solve_lower, solve_upper
+from jaxgrasp.solvers.block.joined import Joined
 from jaxgrasp.solvers.interior_point import Iterate, Residuals
 from jaxgrasp.solvers.small_matrices import (
+    ColumnFactor,
+    cholesky_by_columns,
     flatten,
     inverse_cholesky,
     matvec,
@@ -122,7 +125,8 @@ class Factors(NamedTuple):
     """The reduced Newton system; `border` is None where lambda is held."""
 
     blocks: list[Factor]
-    root: jax.Array  # (eq, eq, *lanes), inverse Cholesky factor of E P^-1 E' + v v'/kappa
+    # Of E P^-1 E' + v v'/kappa: the inverse Cholesky factor, (eq, eq, *lanes), or the factor of rows that are joined.
+    root: jax.Array | ColumnFactor
     weights: Rows
     border: _Border | None
 
@@ -169,6 +173,7 @@ class BlockProblem(ABC):
     dropped: a mask of the equality rows, (eq, *lanes): 1 for rows that are zero, else 0.
     radius: the growth of |x|_inf at the optimum with a negative lambda: at most 1 + radius * max(0, -lambda).
     refinements: the number of steps of iterative refinement of every Newton direction.
+    joined: where the rows of E are not orthonormal, see `joined`; None where they are.
     bordered: whether lambda is an unknown (a constant of the class).
     """
 
@@ -177,6 +182,7 @@ class BlockProblem(ABC):
     dropped: jax.Array
     radius: float = field(metadata={"static": True})
     refinements: int = field(metadata={"static": True})
+    joined: Joined | None = field(default=None, metadata={"static": True})
     bordered = True
 
     @property
@@ -207,17 +213,29 @@ class BlockProblem(ABC):
 
     def equality(self, x: Rows) -> jax.Array:
         """Compute E x, (eq, *lanes)."""
+        if self.joined is not None:
+            return self.joined.equality(self.groups, x)
         products = [g.columns * x_g for g, x_g in zip(self.groups, x, strict=True)]
         return fold(jnp.add, [total(jnp.moveaxis(p, 0, 2)) for p in products])
 
     def pull_back(self, y: jax.Array) -> Rows:
         """Compute E'y, (k, n, *lanes) a group."""
+        if self.joined is not None:
+            return self.joined.pull_back(self.groups, y)
         return tuple(fold(jnp.add, g.columns * y[:, None, None]) for g in self.groups)
 
     def project(self, x: Rows) -> Rows:
-        """Find the nearest point with E x = b, x + E'(b - E x): the rows of E are orthonormal."""
+        """Find a point with E x = b near x."""
         gap = fenced(lambda x: self.rhs - self.equality(x))(x)
-        return tuple(x_g + c for x_g, c in zip(x, self.pull_back(gap), strict=True))
+        return tuple(x_g + c for x_g, c in zip(x, self.restore(gap), strict=True))
+
+    def restore(self, gap: jax.Array) -> Rows:
+        """Find a change that closes a gap b - E x: where the rows of E are orthonormal the least one, E'(b - E x)."""
+        return self.pull_back(gap) if self.joined is None else self.joined.restore(self.groups, gap)
+
+    def balancing(self, pull: Rows) -> jax.Array:
+        """Find the multipliers y with E'y = -pull, (eq, *lanes), if there are any."""
+        return -(self.equality(pull) if self.joined is None else self.joined.multipliers(self.groups, pull))
 
     def violations(self, x: Rows, lam: jax.Array) -> jax.Array:
         """Compute the largest amount by which a point misses any row, (*lanes)."""
@@ -232,10 +250,29 @@ class BlockProblem(ABC):
 
     def factor(self, weights: Rows) -> Factors:
         """Factor the Newton system for weights z/s: eliminate the blocks, then lambda."""
-        # Blocks: L L' = P, with theta = L^-1 p and L^-1 E'.
-        blocks = [self._factor_group(g, w) for g, w in zip(self.groups, weights, strict=True)]
+        if (joined := self._in_turn) is not None:
+            blocks, matrix, v, kappa = joined.eliminate(self, weights)
+        else:
+            # Blocks: L L' = P, with theta = L^-1 p and L^-1 E'.
+            blocks = [self._factor_group(g, w) for g, w in zip(self.groups, weights, strict=True)]
+            matrix, v, kappa = self._reduce(blocks)
+        inverse = None if kappa is None else 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
 
-        # Equality rows and lambda: E P^-1 E', v = -E P^-1 p and 1 / kappa.
+        # Eliminate lambda: E P^-1 E' + v v'/kappa, with ones on the diagonal of dropped rows.
+        @fenced
+        def complete(matrix: jax.Array, v: jax.Array | None, inverse: jax.Array | None) -> jax.Array:
+            eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(*matrix.shape[:2], *[1] * len(self.lanes))
+            matrix = matrix + eye * self.dropped
+            return matrix if v is None or inverse is None else matrix + v[:, None] * (v * inverse)
+
+        border = None if inverse is None or v is None else _Border(inverse, v)
+        matrix = complete(matrix, v, inverse)
+        root = inverse_cholesky(matrix) if self.joined is None else cholesky_by_columns(matrix)
+        return Factors(blocks, root, weights, border)
+
+    def _reduce(self, blocks: list[Factor]) -> tuple:
+        """Compute E P^-1 E', v = -E P^-1 p and kappa; the last two are None where lambda is held."""
+
         @fenced
         def reduce(blocks: list[Factor]) -> tuple:
             columns = [f.columns for f in blocks]
@@ -248,25 +285,21 @@ class BlockProblem(ABC):
                 return matrix, None, None
             terms = [_over_blocks(c * -t, 1) for f in blocks for c, t in zip(f.columns, f.theta, strict=True)]
             kappa = fold(jnp.add, [fold(jnp.add, f.kappa) for f in blocks if f.kappa is not None])
-            return matrix, fold(jnp.add, terms), 1 / jnp.maximum(kappa, jnp.finfo(kappa.dtype).tiny)
+            return matrix, fold(jnp.add, terms), kappa
 
-        # Eliminate lambda: E P^-1 E' + v v'/kappa, with ones on the diagonal of dropped rows.
-        @fenced
-        def complete(matrix: jax.Array, v: jax.Array | None, inverse: jax.Array | None) -> jax.Array:
-            eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(*matrix.shape[:2], *[1] * len(self.lanes))
-            matrix = matrix + eye * self.dropped
-            return matrix if v is None or inverse is None else matrix + v[:, None] * (v * inverse)
+        return reduce(blocks)
 
-        matrix, v, inverse = reduce(blocks)
-        border = _Border(inverse, v) if self.bordered else None
-        return Factors(blocks, inverse_cholesky(complete(matrix, v, inverse)), weights, border)
+    @property
+    def _in_turn(self) -> Joined | None:
+        """What eliminates blocks in turn; None where they are at once, as they are where H ties them together."""
+        return None if any(g.coupled for g in self.groups) else self.joined
 
     def _factor_group(self, g: Blocks, weights: jax.Array) -> Factor:
         if not g.coupled:
-            return self._factor_block(g, weights)
-        return couple(self._factor_block(g._replace(hessian_root=None), weights), g.root, g.columns)
+            return self.factor_block(g, weights)
+        return couple(self.factor_block(g._replace(hessian_root=None), weights), g.root, g.columns)
 
-    def _factor_block(self, g: Blocks, weights: jax.Array) -> BlockFactor:
+    def factor_block(self, g: Blocks, weights: jax.Array) -> BlockFactor:
         """Make the columns of [A, sigma] orthogonal in the inner product of W, by modified Gram-Schmidt.
 
         P = A'W A itself would square the condition, too much for float32.
@@ -316,6 +349,9 @@ class BlockProblem(ABC):
         # Eliminate the blocks: L^-1 r_x, E P^-1 r_x - r_y and r_lambda - p'P^-1 r_x.
         @fenced
         def eliminate(factors: Factors, rhs_x: Rows, rhs_lambda: jax.Array | None, rhs_y: jax.Array) -> tuple:
+            if (joined := self._in_turn) is not None:
+                reduced, right, pull = joined.reduce(self.groups, factors.blocks, rhs_x, rhs_lambda is not None)
+                return reduced, right - rhs_y, None if rhs_lambda is None else rhs_lambda - pull
             reduced = [solve_lower(f, r) for f, r in zip(factors.blocks, rhs_x, strict=True)]
             pairs = [
                 (c, t, a)
@@ -332,12 +368,15 @@ class BlockProblem(ABC):
         def solve_equalities(factors: Factors, right: jax.Array, pull: jax.Array | None) -> jax.Array:
             if factors.border is not None and pull is not None:
                 right = right + factors.border.column * (pull * factors.border.inverse)
+            if isinstance(factors.root, ColumnFactor):
+                return factors.root.down(right)
             return fold(jnp.add, jnp.moveaxis(factors.root * right, 1, 0))
 
         # Then dlambda = (r_lambda - p'P^-1 r_x - v'dy) / kappa.
         @fenced
         def finish_equalities(factors: Factors, root_right: jax.Array, pull: jax.Array | None) -> tuple:
-            dy = matvec_transposed(factors.root, root_right)
+            root = factors.root
+            dy = root.up(root_right) if isinstance(root, ColumnFactor) else matvec_transposed(root, root_right)
             if factors.border is None or pull is None:
                 return dy, None
             return dy, (pull - fold(jnp.add, factors.border.column * dy)) * factors.border.inverse
@@ -345,6 +384,8 @@ class BlockProblem(ABC):
         # Substitute: dx = L^-T (L^-1 r_x - L^-1 E'dy - theta dlambda).
         @fenced
         def substitute(factors: Factors, reduced: list, dy: jax.Array, dlambda: jax.Array | None) -> Rows:
+            if (joined := self._in_turn) is not None:
+                return joined.substitute(self.groups, factors.blocks, reduced, dy, dlambda)
             out = []
             for g, f, r in zip(self.groups, factors.blocks, reduced, strict=True):
                 right = [a - fold(jnp.add, c * dy[:, None]) for c, a in zip(f.columns, r, strict=True)]
