@@ -24,9 +24,25 @@ from jaxgrasp.hands import HandObject, sample_configurations, scenes  # noqa: E4
 
 BATCH = 4096
 ROUNDS = 5
+
+
+def rough_shadow_hand() -> mujoco.MjSpec:
+    """18 actuators, of which four drive two joints each, dry friction of 0.02 N m in 22 joints, and no wrist."""
+    spec = scenes.shadow_hand("sphere", coupled_tendons=True)
+    for wrist in ("rh_WRJ2", "rh_WRJ1"):
+        for actuator in [a for a in spec.actuators if a.target == wrist]:
+            spec.delete(actuator)
+        spec.delete(spec.joint(wrist))
+    for joint in spec.joints:
+        if joint.name != "object":
+            joint.frictionloss = 0.02
+    return spec
+
+
 CASES = {
-    "four fingers, sphere": lambda: scenes.four_fingers("sphere"),
-    "Shadow Hand, sphere": lambda: scenes.shadow_hand("sphere"),
+    "four fingers, sphere": lambda: HandObject.from_mjcf(scenes.four_fingers("sphere"), "object"),
+    "Shadow Hand, sphere": lambda: HandObject.from_mjcf(scenes.shadow_hand("sphere"), "object"),
+    "Shadow Hand, coupled, dry friction": lambda: HandObject.from_mjcf(rough_shadow_hand(), "object", max_contacts=8),
 }
 STAGES = ("kinematics", "points", "grasps", "margins", "plain margins")
 
@@ -122,9 +138,9 @@ def text(results: dict[str, dict], load: float) -> str:
 
 def main() -> None:
     load, results = warn_if_busy(), {}
-    for name, scene in CASES.items():
+    for name, make in CASES.items():
         print(name, flush=True)
-        hand = HandObject.from_mjcf(scene(), "object")
+        hand = make()
         start = time.perf_counter()
         jax.block_until_ready(hand.grasps(np.tile(hand.model.qpos0, (BATCH, 1))))
         compiled = time.perf_counter() - start
