@@ -1,8 +1,9 @@
-"""Starting `jaxgrasp` as its users do, in a folder with candidates, grasps of a hand, and nothing else."""
+"""Starting `jaxgrasp` as its users do, in a folder with candidates, grasps of a hand, and what else commands read."""
 
 from __future__ import annotations
 
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,10 @@ import numpy as np
 
 # As the script that pip installs does.
 PROGRAM = [sys.executable, "-c", "import sys\nfrom jaxgrasp.cli import program\nsys.exit(program())"]
-GRASPS, OF_HAND = "grasps.npz", "hands.npz"
+GRASPS, OF_HAND, ERRORS, HIVE = "grasps.npz", "hands.npz", "errors.json", "hive"
+# A run that was interrupted, and its copy for the command that goes on with it.
+BEGUN, RESUMED = "begun", "resumed"
+_INPUTS = (GRASPS, OF_HAND, ERRORS, HIVE, BEGUN)
 # Of the four fingers around a ball of 5 cm.
 _BENT, _SQUEEZED, _BALL = (0.0, -0.165, 1.124), (0.0, 0.1, 0.1), (0.0, 0.0, 0.085)
 ON_HAND = ["--hand", "four_fingers", "--object", "sphere", "--grasps", OF_HAND]
@@ -46,18 +50,34 @@ def write_hand_grasps(folder: Path, count: int) -> None:
     )
 
 
+def write_runs(folder: Path, part_size: int) -> None:
+    """Writes distributions, a dataset of one file, and a run of it that lacks most of its parts."""
+    (folder / ERRORS).write_text('{"friction": {"std": 0.1, "correlation": 1.0}, "position": 0.002}\n')
+    (folder / HIVE / "object=ball").mkdir(parents=True)
+    shutil.copy(folder / GRASPS, folder / HIVE / "object=ball" / GRASPS)
+    command = [*PROGRAM, "rank", HIVE, "--run", BEGUN, "--part-size", str(part_size)]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    for path in (folder / BEGUN).rglob("*"):
+        if path.is_file() and path.name != "manifest.json" and "-000000" not in path.name:
+            path.unlink()
+
+
 def made(folder: Path) -> list[Path]:
     """List the folders and files that commands have written."""
-    return [path for path in folder.rglob("*") if path.name not in (GRASPS, OF_HAND)]
+    return [path for path in folder.rglob("*") if path.relative_to(folder).parts[0] not in _INPUTS]
 
 
 def empty(folder: Path) -> None:
-    """Removes what commands have written."""
+    """Removes what commands have written, and begins the run that is gone on with once more."""
     for path in folder.iterdir():
+        if path.name in _INPUTS:
+            continue
         if path.is_dir():
             shutil.rmtree(path)
-        elif path.name not in (GRASPS, OF_HAND):
+        else:
             path.unlink()
+    if (folder / BEGUN).exists():
+        shutil.copytree(folder / BEGUN, folder / RESUMED)
 
 
 def unsolved(candidates: Any, *_: Any, progress: Callable[[int], None] = lambda _: None, **__: Any) -> Any:

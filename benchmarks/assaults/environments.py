@@ -21,16 +21,32 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.assaults.commands import GRASPS, OF_HAND, ON_HAND, PROGRAM, empty, write_grasps, write_hand_grasps
+from benchmarks.assaults.commands import (
+    ERRORS,
+    GRASPS,
+    HIVE,
+    OF_HAND,
+    ON_HAND,
+    PROGRAM,
+    RESUMED,
+    empty,
+    write_grasps,
+    write_hand_grasps,
+    write_runs,
+)
 
 COMMANDS = {
-    "rank": ["rank", "grasps.npz"],
+    "rank": ["rank", GRASPS],
+    "rank --uncertainty --explain": ["rank", GRASPS, "--uncertainty", ERRORS, "--draws", "20", "--explain", "2"],
+    "rank --run --sorted": ["rank", HIVE, "--run", "ranked", "--sorted"],
+    "rank --resume": ["rank", "--resume", RESUMED],
     "rank --scene": ["rank", "--scene", "four_fingers", "--samples", "50", "--picture", "None", "--figure", "None"],
     "synthesize": ["synthesize", "--starts", "16", "--steps", "10", "--figure", "None"],
-    "compare": ["compare", "grasps.npz", "--metric", "margin,min_weight"],
+    "compare": ["compare", GRASPS, "--metric", "margin,min_weight"],
     "squeeze": ["squeeze", *ON_HAND],
     "evaluate": ["evaluate", *ON_HAND, "--figure", "None"],
-    "convert": ["convert", "hands.npz", "--to", "dexgraspbench", "--output", "converted"],
+    "evaluate --ray": ["evaluate", *ON_HAND, "--ray", "local"],
+    "convert": ["convert", OF_HAND, "--to", "dexgraspbench", "--output", "converted"],
     "--help": ["--help"],
 }
 
@@ -115,8 +131,7 @@ def main() -> None:
         home.chmod(0o777)
         write_grasps(home, 50, object_name=np.full(50, "größe 猫 $x_\\{"))
         write_hand_grasps(home, 4)
-        for name in (GRASPS, OF_HAND):
-            (home / name).chmod(0o644)
+        write_runs(home, 20)
         for given in environments(root):
             if (output.only or "") not in given.name:
                 continue
@@ -124,7 +139,8 @@ def main() -> None:
             for arguments in COMMANDS.values():
                 empty(home)
                 (home / "out").touch()
-                (home / "out").chmod(0o666)
+                for path in (home, *home.rglob("*")):
+                    path.chmod(0o777 if path.is_dir() else 0o666)
                 cells.append(outcome(arguments, given, home))
             lines.append(f"| {given.name} | {' | '.join(cells)} |")
             print(lines[-1], flush=True)

@@ -20,18 +20,36 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.assaults.commands import ON_HAND, PROGRAM, empty, made, write_grasps, write_hand_grasps
+from benchmarks.assaults.commands import (
+    ERRORS,
+    GRASPS,
+    HIVE,
+    OF_HAND,
+    ON_HAND,
+    PROGRAM,
+    RESUMED,
+    empty,
+    made,
+    write_grasps,
+    write_hand_grasps,
+    write_runs,
+)
 
 COMMANDS = {
-    "rank": ["rank", "grasps.npz", "--figure", "ranking.png"],
-    "rank --metric": ["rank", "grasps.npz", "--metric", "ferrari_canny_bound,margin", "--figure", "None"],
+    "rank": ["rank", GRASPS, "--figure", "ranking.png"],
+    "rank --metric": ["rank", GRASPS, "--metric", "ferrari_canny_bound,margin", "--figure", "None"],
+    "rank --uncertainty --explain": ["rank", GRASPS, "--uncertainty", ERRORS, "--draws", "20", "--explain", "2"],
+    "rank --run --sorted": ["rank", HIVE, "--run", "ranked", "--sorted", "--part-size", "10000"],
+    "rank --resume": ["rank", "--resume", RESUMED, "--sorted"],
+    "rank --run --ray": ["rank", HIVE, "--run", "ranked", "--ray", "local", "--part-size", "10000"],
     "rank --scene": ["rank", "--scene", "four_fingers", "--samples", "500", "--picture", "None"],
     "synthesize": ["synthesize", "--starts", "256"],
     "synthesize --scene": ["synthesize", "--scene", "four_fingers", "--starts", "16", "--picture", "None"],
-    "compare": ["compare", "grasps.npz", "--friction", "0.6", "--max-force", "5"],
+    "compare": ["compare", GRASPS, "--friction", "0.6", "--max-force", "5"],
     "squeeze": ["squeeze", *ON_HAND],
     "evaluate": ["evaluate", *ON_HAND],
-    "convert": ["convert", "hands.npz", "--to", "dexgraspbench", "--output", "converted"],
+    "evaluate --ray": ["evaluate", *ON_HAND, "--ray", "local"],
+    "convert": ["convert", OF_HAND, "--to", "dexgraspbench", "--output", "converted"],
 }
 
 
@@ -70,6 +88,10 @@ def whole(path: Path) -> bool:
         import pyarrow.parquet
 
         return pyarrow.parquet.read_table(path).num_rows > 0
+    if path.suffix == ".arrow":
+        import pyarrow.feather
+
+        return pyarrow.feather.read_table(path).num_columns > 0
     content = path.read_bytes()
     return content.endswith(b"IEND\xaeB`\x82") if path.suffix == ".png" else content.endswith(b"\n")
 
@@ -89,9 +111,10 @@ def once(arguments: list[str], number: int, moment: float, home: Path) -> tuple[
         return f"exit {code}", complaint
     if complaint.count("\n") != 1 or not complaint.startswith("jaxgrasp: "):
         return "not one line", complaint
-    if any(path.name.startswith(".") for path in made(home)):
+    # The lock of a run's folder stays there.
+    if any(path.name.startswith(".") and path.name != ".lock" for path in made(home)):
         return "litter", complaint
-    if not all(whole(path) for path in made(home)):
+    if not all(whole(path) for path in made(home) if path.name != ".lock"):
         return "broken file", complaint
     return ("kept" if made(home) else "ended"), complaint
 
@@ -138,6 +161,7 @@ def main() -> None:
         home = Path(folder)
         write_grasps(home, 100_000)
         write_hand_grasps(home, 2_000)
+        write_runs(home, 10_000)
         say("| command | within, s | signals | before its first line | ended at once | work kept | otherwise |")
         say("|---|---:|---:|---:|---:|---:|---|")
         for name in given.command or COMMANDS:

@@ -19,6 +19,8 @@ ROUNDING = np.float32(1e-6)
 """Rounding of single precision, as a share of the mesh's extent."""
 # Radii of a part between it and a block to which it is a dipole: the sum is then off by about 1e-3.
 _FAR = 2.0
+# Median radii of blocks and of leaves: from here on, points by themselves find their nearest triangles sooner.
+_LARGE = 2.5
 # Pairs of a block and a part at a time, about a hundred bytes each.
 _PAIRS = 1 << 18
 
@@ -42,12 +44,18 @@ class Blocks(NamedTuple):
     radius: Float[np.ndarray, " blocks"]
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "points 3"]) -> "Blocks":
-        """Puts points in blocks."""
+    def of(cls, points: Float[np.ndarray, "points 3"], size: int = BLOCK) -> "Blocks":
+        """Puts points in blocks of so many."""
         order = _along_curve(points)
-        padded = np.pad(points[order], [(0, -len(points) % BLOCK), (0, 0)], mode="edge").reshape(-1, BLOCK, 3)
+        padded = np.pad(points[order], [(0, -len(points) % size), (0, 0)], mode="edge").reshape(-1, size, 3)
         lower, upper = padded.min(1), padded.max(1)
         return cls(padded, order, lower, upper, 0.5 * (lower + upper), 0.5 * _length(upper - lower))
+
+    def in_order(self, results: Float[np.ndarray, "blocks block"]) -> Float[np.ndarray, " points"]:
+        """Results of the points, in the order in which these were given."""
+        found = np.empty(len(self.order), results.dtype)
+        found[self.order] = results.reshape(-1)[: len(self.order)]
+        return found
 
 
 class _Level(NamedTuple):
@@ -95,6 +103,12 @@ class TriangleTree:
     def scaled(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
         """Points in the lengths of the tree, in single precision."""
         return np.asarray((points - self.centre) / self.extent, np.float32)
+
+    def blocks_for_nearest(self, points: Float[np.ndarray, "points 3"]) -> Blocks:
+        """Blocks of points as `nearest` takes least time for: of one point each where the leaves are small."""
+        blocks = Blocks.of(points)
+        large = np.median(blocks.radius) > _LARGE * np.median(self._levels[-1].radius)
+        return Blocks.of(points, 1) if large else blocks
 
     def nearest(self, blocks: Blocks) -> Iterator[Pairs]:
         """Pairs of blocks and leaves, among which is the nearest triangle of each point of a block."""

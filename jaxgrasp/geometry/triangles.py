@@ -50,28 +50,39 @@ def signed_distances(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) 
     Raises:
         ValueError: too many triangles are long or overlap, so that distances would take long.
     """
-    blocks = Blocks.of(tree.scaled(points))
-    squared = np.full(blocks.points.shape[:2], np.inf, np.float32)
-    work = 0
+    scaled = tree.scaled(points)
+    squared, work = _squares(tree, scaled)
+    angles = _windings(tree, scaled, work)
+    return np.where(angles > math.pi, -1.0, 1.0) * np.sqrt(squared) * tree.extent
+
+
+def _squares(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, int]:
+    """Squared distances, and how many pairs of points and leaves were looked at."""
+    blocks = tree.blocks_for_nearest(points)
+    size = blocks.points.shape[1]
+    squared, work = np.full(blocks.points.shape[:2], np.inf, np.float32), 0
     for near in tree.nearest(blocks):
         # Of a block's leaves, few have to do with each of its points.
         least, most = _in_chunks(_squares_to_boxes, tree.boxes, blocks.points, near).swapaxes(0, 1)
         _reduce(np.minimum, squared, near, most)
         pair, place = np.nonzero(least <= (np.sqrt(squared) + ROUNDING)[near.blocks] ** 2)
-        own = Pairs(BLOCK * near.blocks[pair] + place, near.parts[pair])
+        own = Pairs(size * near.blocks[pair] + place, near.parts[pair])
         work = _spent(work, len(near.blocks) + len(pair))
         found = _in_chunks(_least_squares, tree.leaves, blocks.points.reshape(-1, 1, 3), own)
         np.minimum.at(squared.reshape(-1), own.blocks, found[:, 0])
+    return blocks.in_order(squared), work
+
+
+def _windings(tree: TriangleTree, points: Float[np.ndarray, "points 3"], work: int) -> np.ndarray:
+    """Half the solid angles under which the surface is seen; `work` pairs of points and leaves came before."""
+    blocks = Blocks.of(points)
     angles = np.zeros(blocks.points.shape[:2])
     for near, far, level in tree.around(blocks):
         work = _spent(work, BLOCK * len(near.blocks))
         _reduce(np.add, angles, near, _in_chunks(_half_angles, tree.leaves, blocks.points, near))
         dipoles = np.concatenate([level.middle, level.area], -1)
         _reduce(np.add, angles, far, _in_chunks(_half_angles_of_dipoles, dipoles, blocks.points, far))
-    found = np.empty(len(points))
-    signs = np.where(angles > math.pi, -1.0, 1.0)
-    found[blocks.order] = (signs * np.sqrt(squared) * tree.extent).reshape(-1)[: len(points)]
-    return found
+    return blocks.in_order(angles)
 
 
 def _spent(before: int, more: int) -> int:

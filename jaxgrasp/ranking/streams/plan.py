@@ -138,8 +138,9 @@ class PartReader:
             self._rows = self._open.enter_context(rows_from(source, segment.start, self._given))
         candidates, travelling = self._rows.read(segment.stop - segment.start)
         self._next = (segment.source, segment.stop)
-        for key, value in source.keys:
-            travelling = travelling.append_column(key, pa.repeat(value, len(candidates)))
+        columns = dict(zip(travelling.column_names, travelling.columns, strict=True))
+        # A table without columns has no rows, whatever is appended.
+        travelling = pa.table(columns | {key: pa.repeat(value, len(candidates)) for key, value in source.keys})
         candidates = replace(
             candidates, sources=(source.name,), index=np.arange(segment.start, segment.stop, dtype=np.int64)
         )
