@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,8 @@ def made(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if path.relative_to(folder).parts[0] not in _INPUTS]
 
 
-def empty(folder: Path) -> None:
-    """Removes what commands have written, and begins the run that is gone on with once more."""
+def prepare(folder: Path, arguments: list[str]) -> None:
+    """Removes what commands have written, and copies the run that this one goes on with."""
     for path in folder.iterdir():
         if path.name in _INPUTS:
             continue
@@ -76,7 +77,7 @@ def empty(folder: Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink()
-    if (folder / BEGUN).exists():
+    if RESUMED in arguments:
         shutil.copytree(folder / BEGUN, folder / RESUMED)
 
 
@@ -99,3 +100,49 @@ def unsolved(candidates: Any, *_: Any, progress: Callable[[int], None] = lambda 
         tightening_status=np.zeros(0, int),
         controls=np.zeros((0, 0)),
     )
+
+
+def leave_out_computation() -> None:
+    """Makes this process rank nothing, in one table and part by part."""
+    import jaxgrasp.cli.uncertain
+    import jaxgrasp.ranking
+    import jaxgrasp.ranking.streams.run
+    import jaxgrasp.ranking.streams.scored
+
+    jaxgrasp.ranking.rank = unsolved
+    jaxgrasp.ranking.uncertain_scores = _certain
+    jaxgrasp.ranking.streams.run.scored = _unscored
+    jaxgrasp.ranking.streams.scored.tighten = _untightened
+
+
+def _certain(candidates: Any, uncertain: Any, *_: Any, **__: Any) -> Any:
+    import jax
+    import jax.numpy as jnp
+
+    from jaxgrasp.uncertainty.draws import draw
+
+    # Here distributions prove to be those of such candidates, or not.
+    given = uncertain.uncertainty
+    draws = lambda seed: draw(given, candidates.num_contacts, given.sample_count() or 10, seed, jnp.dtype(float))
+    jax.eval_shape(draws, jnp.uint32(0))
+    return {name: np.ones(len(candidates)) for name in uncertain.names}
+
+
+def _unscored(candidates: Any, travelling: Any, setting: Any, **_: Any) -> Any:
+    from jaxgrasp.ranking.streams.scored import Scored
+
+    count = len(candidates)
+    return Scored(
+        candidates=candidates,
+        travelling=travelling,
+        margin=np.ones(count),
+        upper_bound=np.ones(count),
+        status=np.zeros(count, int),
+        metrics={name: np.ones(count) for name in setting.columns},
+    )
+
+
+def _untightened(candidates: Any, margin: np.ndarray, *_: Any, metrics: Any, **__: Any) -> Any:
+    count, none = len(margin), np.zeros((len(margin), candidates.num_contacts, 3))
+    found = replace(unsolved(candidates), forces=none, object_forces=none, effort=np.zeros(count))
+    return replace(found, tightening_status=np.zeros(count, int), controls=np.zeros((count, 0)), metrics=metrics)

@@ -29,7 +29,7 @@ from benchmarks.assaults.commands import (
     ON_HAND,
     PROGRAM,
     RESUMED,
-    empty,
+    prepare,
     write_grasps,
     write_hand_grasps,
     write_runs,
@@ -121,7 +121,7 @@ def outcome(arguments: list[str], given: Environment, home: Path) -> str:
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--output", type=Path)
-    options.add_argument("--only", help="environments with this in their name alone")
+    options.add_argument("--only", nargs="+", default=[""], help="environments with one of these in their name alone")
     output = options.parse_args()
     lines = [f"| | {' | '.join(f'`{name}`' for name in COMMANDS)} |", "|---|" + "---|" * len(COMMANDS)]
     with tempfile.TemporaryDirectory() as name:
@@ -133,11 +133,11 @@ def main() -> None:
         write_hand_grasps(home, 4)
         write_runs(home, 20)
         for given in environments(root):
-            if (output.only or "") not in given.name:
+            if not any(part in given.name for part in output.only):
                 continue
             cells = []
             for arguments in COMMANDS.values():
-                empty(home)
+                prepare(home, arguments)
                 (home / "out").touch()
                 for path in (home, *home.rglob("*")):
                     path.chmod(0o777 if path.is_dir() else 0o666)

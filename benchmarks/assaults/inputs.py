@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.assaults.arrays import archives, arrays
+from benchmarks.assaults.distributions import archived_distributions, distributions
 from benchmarks.assaults.further import more_archives, more_arrays, more_models, more_obj, more_ply, more_stl
 from benchmarks.assaults.models import models
 from benchmarks.assaults.shapes import large_obj, large_ply, large_stl, obj, ply, stl
+from benchmarks.assaults.streamed import arrows, parquets, runs
 
 
 @dataclass(frozen=True)
 class Case:
     kind: str
-    """npz, npy, stl, obj, ply or xml."""
+    """One of `MAKERS`."""
     name: str
     path: Path
 
@@ -31,6 +33,11 @@ MAKERS = {
     "obj": (obj, more_obj, large_obj),
     "ply": (ply, more_ply, large_ply),
     "xml": (models, more_models),
+    "json": (distributions,),
+    "errors.npz": (archived_distributions,),
+    "parquet": (parquets,),
+    "arrow": (arrows,),
+    "run": (runs,),
 }
 LARGE = (large_stl, large_obj, large_ply)
 

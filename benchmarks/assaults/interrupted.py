@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import json
 import os
 import random
 import signal
@@ -28,8 +29,8 @@ from benchmarks.assaults.commands import (
     ON_HAND,
     PROGRAM,
     RESUMED,
-    empty,
     made,
+    prepare,
     write_grasps,
     write_hand_grasps,
     write_runs,
@@ -92,13 +93,15 @@ def whole(path: Path) -> bool:
         import pyarrow.feather
 
         return pyarrow.feather.read_table(path).num_columns > 0
+    if path.suffix == ".json":
+        return bool(json.loads(path.read_bytes()))
     content = path.read_bytes()
     return content.endswith(b"IEND\xaeB`\x82") if path.suffix == ".png" else content.endswith(b"\n")
 
 
 def once(arguments: list[str], number: int, moment: float, home: Path) -> tuple[str, str]:
     """The outcome of one signal in a word, and what the command printed."""
-    empty(home)
+    prepare(home, arguments)
     try:
         code, complaint, begun = signalled(arguments, number, moment, home)
     except subprocess.TimeoutExpired:
@@ -136,7 +139,7 @@ def row(name: str, number: int, count: int, within: float, home: Path, draw: ran
 def length(name: str, home: Path) -> float:
     """How long a command takes whose kernels and programs are on disk, s."""
     for _ in range(2):
-        empty(home)
+        prepare(home, COMMANDS[name])
         begun = time.perf_counter()
         subprocess.run([*PROGRAM, *COMMANDS[name]], cwd=home, check=True, capture_output=True)
     return time.perf_counter() - begun

@@ -24,17 +24,24 @@ import numpy as np
 
 from benchmarks.assaults import outcomes
 from benchmarks.assaults.arrays import grasps
-from benchmarks.assaults.commands import unsolved
+from benchmarks.assaults.commands import leave_out_computation
 from benchmarks.assaults.inputs import Case, cases
 from benchmarks.assaults.outcomes import Outcome, table
 
+# Of what a command does by itself.
+_OF_MESHES = ["--starts", "8", "--steps", "10"]
+_FEW = {"xml": ["--samples", "8"], "stl": _OF_MESHES, "obj": _OF_MESHES, "ply": _OF_MESHES}
 RANK = ["--output", "table.csv", "--figure", "None", "--top", "2"]
 
 
 def arguments(case: Case, good: Path) -> list[str]:
     path = os.fspath(case.path)
-    if case.kind == "npz":
+    if case.kind in ("npz", "parquet", "arrow"):
         return ["rank", path, *RANK]
+    if case.kind in ("json", "errors.npz"):
+        return ["rank", os.fspath(good), "--uncertainty", path, *RANK]
+    if case.kind == "run":
+        return ["rank", "--resume", path, "--sorted", "--top", "2"]
     if case.kind == "npy":
         return ["rank", os.fspath(good), "--disturbances", path, *RANK]
     if case.kind == "xml":
@@ -48,7 +55,7 @@ def forked(case: Case, good: Path, home: Path) -> Outcome:
 
 
 def commanded(case: Case, good: Path, home: Path) -> Outcome:
-    few = {"npz": [], "npy": [], "xml": ["--samples", "8"]}.get(case.kind, ["--starts", "8", "--steps", "10"])
+    few = _FEW.get(case.kind, [])
     return outcomes.commanded(case, [*arguments(case, good), *few], home)
 
 
@@ -56,13 +63,12 @@ def _leave_out_computation() -> None:
     """Ranks nothing, and ends the process where a mesh or a model has been accepted."""
     import jaxgrasp.cli.scene
     import jaxgrasp.geometry
-    import jaxgrasp.ranking
 
     def accept(*_: Any, **__: Any) -> None:
         sys.stderr.flush()
         os._exit(0)
 
-    jaxgrasp.ranking.rank = unsolved
+    leave_out_computation()
     jaxgrasp.geometry.sample_surface = accept
     # The first that a command does with a model that was read.
     jaxgrasp.cli.scene.Scene._sampled = accept
@@ -102,7 +108,8 @@ def main() -> None:
     import jaxgrasp.cli.subcommands
     import jaxgrasp.geometry
     import jaxgrasp.hands.scenes
-    import jaxgrasp.ranking
+    import jaxgrasp.ranking.streams.run
+    import jaxgrasp.uncertainty
     import jaxgrasp.viewer  # noqa: F401
 
     # Some of the archives to be made have two members of one name.

@@ -13,7 +13,7 @@ from jaxgrasp.uncertainty.spec import QUANTITIES, Distribution, Samples, Uncerta
 _OPTIONS = {"std", "mean", "lower", "upper", "correlation", "half_width", "samples"}
 _OF_UNIFORM = {"half_width", "mean", "correlation"}
 # A matrix of 64 contacts' positions has 36,864 numbers.
-_LARGEST, _COST = 1 << 24, 16
+_LARGEST, _COST = 1 << 22, 16
 
 
 def read_uncertainty(path: Path | str) -> Uncertainty:

@@ -150,6 +150,14 @@ def test_folders_that_stand_for_columns(here, capsys):
     assert ran("in", "--output", "all.csv", "--figure", "None") == 0
     assert ran("in/hand=shadow", "--output", "one.parquet", "--figure", "None") == 0
     assert set(pyarrow.parquet.read_table("one.parquet")["hand"].to_pylist()) == {"shadow"}
+    # Files that have no other columns.
+    bare = here / "bare" / "hand=allegro"
+    bare.mkdir(parents=True)
+    write(bare / "a.npz", name=None)
+    named = pyarrow.parquet.read_table(write(bare / "b.parquet"))
+    pyarrow.parquet.write_table(named.drop_columns("name"), bare / "b.parquet")
+    assert ran("bare", "--run", "of_bare", "--top", TOP) == 0
+    assert rows_of("of_bare")["hand"].to_pylist() == 80 * ["allegro"]
 
 
 def test_urls(here, capsys):
@@ -335,9 +343,13 @@ def test_folders_that_cannot_be_used(begun, capsys):
     assert "found: got the folder of a run; wanted a new one, or --resume found" in capsys.readouterr().err
     assert ran("--resume", "nowhere") == 2
     assert "--resume: nowhere/manifest.json: got no such file" in capsys.readouterr().err
-    (begun / "found" / "manifest.json").write_text("[]")
-    assert ran("--resume", "found") == 2
-    assert "manifest.json: got no manifest" in capsys.readouterr().err
+    manifest = begun / "found" / "manifest.json"
+    whole = manifest.read_bytes()
+    for content in (b"[]", whole[:-1], whole.replace(b'"rows"', b'"rowz"'), whole.replace(b"null", b"true", 1)):
+        assert content != whole
+        manifest.write_bytes(content)
+        assert ran("--resume", "found") == 2
+        assert "manifest.json: got no manifest, or a damaged one" in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -1,12 +1,14 @@
 """The folder of a run: a manifest that says what is ranked and how, and parts that are whole or not there.
 
-manifest.json        inputs with sizes and digests, options, version
+manifest.json        inputs with sizes and digests, options, version, and a digest of all that
 parts/part-*.parquet a row a candidate, in the order of the inputs
 summaries/*.arrow    of each part: a sketch of the margins, and its best candidates
 top.parquet          the best with their forces
 """
 
+import hashlib
 import json
+import re
 import secrets
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -22,7 +24,9 @@ from jaxgrasp.ranking.table import parquet_writer
 from jaxgrasp.storage import FileError, atomic_write, open_regular
 
 MANIFEST = "manifest.json"
-_FORMAT = 1
+_FORMAT = 2
+# What comes first in a manifest: the digest of the bytes behind it.
+_DIGEST = re.compile(rb'\{"digest": "([0-9a-f]{32})",')
 # Where a reader of the file finds which run and which part it is of.
 _KEY = b"jaxgrasp"
 _OF_SOURCES = ("path", "rows", "size", "digest")
@@ -54,18 +58,19 @@ class Manifest:
         """Reads that of a folder.
 
         Raises:
-            FileError: There is none, or it is no manifest.
+            FileError: There is none, or it is no manifest, or not what `write` wrote.
         """
         path = folder / MANIFEST
         with open_regular(path, "the manifest of a run (jaxgrasp rank --run)") as stream:
             content = stream.read()
-        try:
-            found = json.loads(content)
-            if found.pop("format") != _FORMAT:
-                raise ValueError("another format")
-            return cls(**found)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise FileError(path, None, f"no manifest ({type(error).__name__})", "that of a run") from error
+        start = _DIGEST.match(content)
+        body = content[start.end() :] if start else b""
+        if start is None or start[1] != _digest(body):
+            raise FileError(path, None, "no manifest, or a damaged one", "that of a run")
+        found = json.loads(b"{" + body)
+        if found.pop("format") != _FORMAT:
+            raise FileError(path, None, "a manifest of another format", f"format {_FORMAT}")
+        return cls(**found)
 
     def write(self, folder: Path) -> None:
         """Writes it into a folder.
@@ -73,8 +78,9 @@ class Manifest:
         Raises:
             OSError: It cannot be written.
         """
+        body = json.dumps({"format": _FORMAT, **asdict(self)}, indent=1).encode()[1:]
         with atomic_write(folder / MANIFEST) as stream:
-            stream.write(json.dumps({"format": _FORMAT, **asdict(self)}, indent=1).encode())
+            stream.write(b'{"digest": "' + _digest(body) + b'",' + body)
 
     def other_options(self, version: str, options: dict[str, Any]) -> str:
         """What is asked otherwise than when the run began, in words; empty where nothing is.
@@ -156,6 +162,10 @@ class Parts:
 
     def _summary(self, number: int) -> Path:
         return self._folder / "summaries" / f"part-{number:06d}.arrow"
+
+
+def _digest(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=16).hexdigest().encode()
 
 
 def _inputs(sources: Sequence[Source]) -> list[dict[str, Any]]:
