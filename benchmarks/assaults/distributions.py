@@ -68,7 +68,7 @@ def distributions(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
     for name in ("friction", "position", "mass"):
         for number, value in enumerate(_VALUES):
             yield f"{name}_{number}", f'{{"{name}": {value}}}'.encode()
-    for label, content in {
+    yield from {
         "list": b"[1]",
         "number": b"1",
         "text": b'"x"',
@@ -91,8 +91,7 @@ def distributions(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:
         "lists": b'{"friction": {"samples": [' + b"[0.1]," * 2_000_000 + b"[0.1]]}}",
         "many": b'{"friction": 0.1, "a": [' + b"{}," * 5_000_000 + b"{}]}",
         "samples_apart": b'{"friction": {"samples": [[1, 1, 1], [1, 1, 1]]}, "mass": {"samples": [1]}}',
-    }.items():
-        yield label, content
+    }.items()
 
 
 def archived_distributions(draw: random.Random, home: Path) -> Iterator[tuple[str, Any]]:

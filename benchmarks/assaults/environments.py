@@ -47,7 +47,7 @@ COMMANDS = {
     "evaluate": ["evaluate", *ON_HAND, "--figure", "None"],
     "evaluate --ray": ["evaluate", *ON_HAND, "--ray", "local"],
     "convert": ["convert", OF_HAND, "--to", "dexgraspbench", "--output", "converted"],
-    "--help": ["--help"],
+    "help": ["--help"],
 }
 
 
@@ -122,8 +122,9 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--output", type=Path)
     options.add_argument("--only", nargs="+", default=[""], help="environments with one of these in their name alone")
+    options.add_argument("--command", nargs="+", choices=COMMANDS, default=[*COMMANDS])
     output = options.parse_args()
-    lines = [f"| | {' | '.join(f'`{name}`' for name in COMMANDS)} |", "|---|" + "---|" * len(COMMANDS)]
+    lines = [f"| | {' | '.join(f'`{name}`' for name in output.command)} |", "|---|" + "---|" * len(output.command)]
     with tempfile.TemporaryDirectory() as name:
         root, home = Path(name), Path(name, "home")
         root.chmod(0o755)
@@ -136,12 +137,13 @@ def main() -> None:
             if not any(part in given.name for part in output.only):
                 continue
             cells = []
-            for arguments in COMMANDS.values():
+            for arguments in (COMMANDS[name] for name in output.command):
                 prepare(home, arguments)
                 (home / "out").touch()
                 for path in (home, *home.rglob("*")):
                     path.chmod(0o777 if path.is_dir() else 0o666)
                 cells.append(outcome(arguments, given, home))
+                print(given.name, arguments[:3], cells[-1], file=sys.stderr, flush=True)
             lines.append(f"| {given.name} | {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     if output.output:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import pickle
 import sys
 import tempfile
 import warnings
@@ -47,6 +48,22 @@ def arguments(case: Case, good: Path) -> list[str]:
     if case.kind == "xml":
         return ["rank", "--scene", path, *RANK, "--picture", "None"]
     return ["synthesize", "--object", path, "--figure", "None", "--output", "table.npz"]
+
+
+def made(folder: Path, kind: str | None) -> list[Case]:
+    """Makes the inputs in a process of its own: those that are forked from this one begin with its memory."""
+    path = folder / "cases"
+    child = os.fork()
+    if child == 0:
+        try:
+            # Some of the archives have two members of one name.
+            warnings.simplefilter("ignore")
+            path.write_bytes(pickle.dumps(cases(folder / "inputs", kind, large=True)))
+            os._exit(0)
+        finally:
+            os._exit(1)
+    os.waitpid(child, 0)
+    return pickle.loads(path.read_bytes())
 
 
 def forked(case: Case, good: Path, home: Path) -> Outcome:
@@ -112,13 +129,11 @@ def main() -> None:
     import jaxgrasp.uncertainty
     import jaxgrasp.viewer  # noqa: F401
 
-    # Some of the archives to be made have two members of one name.
-    warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
         good, home = Path(folder, "good.npz"), Path(folder, "home")
         home.mkdir()
         np.savez(good, **grasps())
-        tried = cases(Path(folder, "inputs"), given.kind, large=True)[:: given.every]
+        tried = made(Path(folder), given.kind)[:: given.every]
         tried = [c for c in tried if (given.name or "") in c.name]
         found = []
         for case in tried:

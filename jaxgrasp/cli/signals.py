@@ -29,6 +29,7 @@ class _Watch:
         self.received: int | None = None
         self.worth_keeping = False
         self.stopped = False
+        self.leaving = False
         self.written: list[str] = []
 
     def listen(self, inbox: int) -> None:
@@ -50,6 +51,7 @@ class _Watch:
 
     def leave(self, number: int) -> None:
         """Ends the process from this thread."""
+        self.leaving = True
         with contextlib.suppress(OSError):
             # Bars hide the cursor. The main thread may hold the locks of Python's own streams.
             line = f"jaxgrasp: {outcome(number)}\n".encode("utf-8", "backslashreplace")
@@ -127,6 +129,12 @@ def outcome(number: int | None = None) -> str:
     """The same, and what is left of the command's work."""
     written = ", ".join(_watch.written) if _watch is not None else ""
     return f"{word(number)}, {f'written: {written}' if written else 'nothing was written'}"
+
+
+def let_end() -> None:
+    """Waits for the process to end where a signal ends it: what fails meanwhile fails for that, and is not told."""
+    if _watch is not None and _watch.leaving:
+        threading.Event().wait()
 
 
 def end(code: object) -> None:

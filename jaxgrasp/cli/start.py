@@ -10,7 +10,10 @@ from jaxgrasp.cli.streams import one_line, prepared, printing, tell_notices
 def run(arguments: Sequence[str] | None) -> int:
     """Runs a command, see `jaxgrasp.cli.main`."""
     with signals.handled(), prepared():
-        code, line = _answer(arguments)
+        try:
+            code, line = _answer(arguments)
+        finally:
+            signals.let_end()
         number = signals.received()
         if number is not None:
             code, line = 128 + number, line if signals.stopped() else signals.outcome()

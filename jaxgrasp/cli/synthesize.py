@@ -218,14 +218,9 @@ class Synthesize(Reading):
         )
 
     def _write(self, found: "Synthesis", shape: "Shape", name: str, unit: str) -> tuple[list[Path], list[str]]:
-        import jax
         import numpy as np
 
-        from jaxgrasp.geometry import sample_surface
-        from jaxgrasp.viewer import figure_of_synthesis, write_figure
-
         count = len(found.margin)
-        surface = np.asarray(sample_surface(shape, jax.random.key(self.seed), 1500)) - found.center_of_mass
 
         def write_candidates(path: Path) -> None:
             with atomic_write(path) as stream:
@@ -241,6 +236,12 @@ class Synthesize(Reading):
                 )
 
         def write_picture(path: Path) -> None:
+            import jax
+
+            from jaxgrasp.geometry import sample_surface
+            from jaxgrasp.viewer import figure_of_synthesis, write_figure
+
+            surface = np.asarray(sample_surface(shape, jax.random.key(self.seed), 1500)) - found.center_of_mass
             write_figure(
                 figure_of_synthesis(found, surface, friction=self.friction or _FRICTION, name=name, unit=unit), path
             )

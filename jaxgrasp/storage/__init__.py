@@ -13,7 +13,15 @@ from jaxgrasp.storage.arrays import (
     read_objects,
 )
 from jaxgrasp.storage.cache import cache_folder
-from jaxgrasp.storage.reading import FileError, allowance, limited_to, open_regular, printable, reason_of
+from jaxgrasp.storage.reading import (
+    FileError,
+    allowance,
+    check_inflation,
+    limited_to,
+    open_regular,
+    printable,
+    reason_of,
+)
 from jaxgrasp.storage.rows import ArchiveRows
 from jaxgrasp.storage.writing import atomic_write, check_writable, claimed, discard_unfinished, made_folder, unfinished
 
@@ -28,6 +36,7 @@ __all__ = [
     "array_of_bytes",
     "atomic_write",
     "cache_folder",
+    "check_inflation",
     "check_writable",
     "claimed",
     "discard_unfinished",

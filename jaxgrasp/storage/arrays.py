@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 
-from jaxgrasp.storage.reading import FileError, allowance, in_bytes, open_regular, reason_of
+from jaxgrasp.storage.reading import FileError, allowance, check_inflation, in_bytes, open_regular, reason_of
 
 # What zipfile and zlib raise for damaged, encrypted or oddly compressed members.
 BROKEN = (ValueError, KeyError, IndexError, EOFError, OSError, RuntimeError, MemoryError, OverflowError)
@@ -28,9 +28,6 @@ _HEADER = 1024
 _DIMENSIONS = 32
 _CHUNK = 1 << 18
 _MEMBERS, _DIRECTORY = 2_000, 4 << 20
-# Archives of zeros shrink a thousandfold; grasps, hardly at all. Small members, such as a constant column of a million
-# candidates, may shrink as they like.
-_INFLATION, _SMALL = 100, 256 << 20
 PICKLE_COST = 16
 """Bytes of memory that a byte of a pickle, or of an archive with one, may come to take in other types and objects."""
 
@@ -124,9 +121,7 @@ class Archive:
         members = [self._members[name] for name in names]
         largest = max(names, key=lambda name: self.headers[name].cost, default=None)
         inflated, stored = (sum(getattr(m, which) for m in members) for which in ("file_size", "compress_size"))
-        if inflated > max(_SMALL, _INFLATION * stored):
-            got = f"{in_bytes(stored)} that inflate to {in_bytes(inflated)}"
-            raise FileError(self._path, largest, got, f"at most {_INFLATION} times as much (numpy.savez does so)")
+        check_inflation(self._path, largest, stored, inflated, " (numpy.savez does so)")
 
     def _header(self, name: str, member: zipfile.ZipInfo) -> Header:
         try:

@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+# Archives of zeros shrink a thousandfold; grasps, hardly at all. Small members, such as a constant column of a million
+# candidates, may shrink as they like.
+_INFLATION, _SMALL = 100, 256 << 20
 # A million candidates with eight contacts and their frames take 0.9 GiB.
 _allowance = contextvars.ContextVar("allowance", default=2 << 30)
 
@@ -117,3 +120,21 @@ def in_bytes(size: float) -> str:
             return f"{size:.3g} {unit}"
         size /= 1024
     return f"{size:.3g} TiB"
+
+
+def check_inflation(path: Path | str, field: str | None, stored: int, inflated: int, remedy: str = "") -> None:
+    """Refuses what would inflate to more than 256 MiB and a hundredfold: grasps hardly shrink.
+
+    Args:
+        path: The file.
+        field: The largest part of it; None where none is named.
+        stored: Bytes on the disk.
+        inflated: Bytes in memory.
+        remedy: Who writes such files otherwise.
+
+    Raises:
+        FileError: It would.
+    """
+    if inflated > max(_SMALL, _INFLATION * stored):
+        got = f"{in_bytes(stored)} that inflate to {in_bytes(inflated)}"
+        raise FileError(path, field, got, f"at most {_INFLATION} times as much{remedy}")

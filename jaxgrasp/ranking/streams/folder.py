@@ -156,7 +156,9 @@ class Parts:
             if (about["run"], about["part"], about["rows"]) != (self._run, number, rows):
                 return None
             with open_regular(self._summary(number)) as stream:
-                return Summary.from_table(ipc.open_file(stream).read_all()), about["skipped"]
+                table = ipc.open_file(stream).read_all()
+            table.validate(full=True)
+            return Summary.from_table(table), about["skipped"]
         except (FileError, pa.ArrowException, OSError, ValueError, KeyError, TypeError):
             return None
 

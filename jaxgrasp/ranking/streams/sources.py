@@ -15,8 +15,19 @@ from pyarrow import ipc, parquet
 from jaxgrasp.candidates import Candidates
 from jaxgrasp.candidates.arrow import candidates_of_table
 from jaxgrasp.candidates.reader import FIELDS, candidates_of_arrays, fields_of
+from jaxgrasp.ranking.streams.arrow_files import declared, whole_batch
 from jaxgrasp.ranking.table import arrow_column
-from jaxgrasp.storage import Archive, ArchiveRows, FileError, allowance, archive_in, open_regular, printable, reason_of
+from jaxgrasp.storage import (
+    Archive,
+    ArchiveRows,
+    FileError,
+    allowance,
+    archive_in,
+    check_inflation,
+    open_regular,
+    printable,
+    reason_of,
+)
 
 _WANTED = "a file of candidates, .npz, Parquet or Arrow"
 _KINDS = {b"PK": "npz", b"\x93NUMPY": "npz", b"PAR1": "parquet", b"ARROW1": "arrow"}
@@ -152,7 +163,7 @@ def source_of(name: str, given: Given) -> Source:
                 rows, sample, travelling = _declared(archive, name, given)
             names = tuple(archive.headers)
         else:
-            schema, rows = _schema(stream, kind)
+            schema, rows = _schema(stream, name, kind, size)
             sample, travelling = candidates_of_table(schema.empty_table(), name, **vars(given))
             names, travelling = schema.names, travelling.schema
             if not rows:
@@ -219,6 +230,7 @@ class _TableRows:
     def __init__(self, source: Source, batches: Iterator[pa.RecordBatch], skip: int, given: Given):
         self._source, self._batches, self._given = source, batches, given
         self._left: pa.RecordBatch | None = None
+        self._inflated = 0
         while skip > 0:
             skip -= self._next(skip).num_rows
 
@@ -239,6 +251,9 @@ class _TableRows:
                 self._left = next(self._batches, None)
             if self._left is None:
                 raise FileError(self._source.name, None, "fewer rows than before", f"{self._source.rows:,}")
+            # Numbers that repeat take hardly any bytes of Parquet, and nothing tells how many they are.
+            self._inflated += self._left.nbytes
+            check_inflation(self._source.name, None, self._source.size, self._inflated)
         found, self._left = self._left.slice(0, most), self._left.slice(most)
         return found
 
@@ -267,20 +282,20 @@ def _declared(archive: Archive, name: str, given: Given) -> tuple[int, Candidate
 _NUMBERS = ("positions", "outward_normals", "frames", "friction", "torsional_friction", "max_force", "mass")
 
 
-def _schema(stream: BinaryIO, kind: str) -> tuple[pa.Schema, int]:
+def _schema(stream: BinaryIO, name: str, kind: str, size: int) -> tuple[pa.Schema, int]:
     if kind == "parquet":
         file = parquet.ParquetFile(stream)
         return file.schema_arrow.remove_metadata(), file.metadata.num_rows
-    reader = ipc.open_file(stream)
-    rows = sum(reader.get_batch(number).num_rows for number in range(reader.num_record_batches))
-    return reader.schema.remove_metadata(), rows
+    found = declared(stream)
+    check_inflation(name, None, size, found.inflated)
+    return found.schema, found.rows
 
 
 def _batches(stream: BinaryIO, kind: str, start: int) -> tuple[Iterator[pa.RecordBatch], int]:
     """Batches of rows, and how many of the first to pass over."""
     if kind == "arrow":
         reader = ipc.open_file(stream)
-        return (reader.get_batch(number) for number in range(reader.num_record_batches)), start
+        return (whole_batch(reader, number) for number in range(reader.num_record_batches)), start
     # A group of rows may be larger than memory: its columns are read piece by piece.
     file = parquet.ParquetFile(stream, pre_buffer=False, buffer_size=1 << 20)
     first = 0
