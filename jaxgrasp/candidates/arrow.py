@@ -21,6 +21,7 @@ from jaxgrasp.candidates.reader import (
     refuse_missing,
     refuse_misspelt,
 )
+from jaxgrasp.storage import allowance
 
 _OWN = tuple(name for name in FIELDS if name != "center_of_mass")
 # What every contact has beside its own place, and what an absent one gets: no arithmetic on it can then yield a NaN.
@@ -89,13 +90,18 @@ def columns_of_table(table: pa.Table) -> dict[str, np.ndarray]:
 
     Returns:
         Arrays with a leading axis of rows by name; what is null is NaN or empty.
+
+    Raises:
+        CandidateError: Text in it is too long for NumPy, which gives every row as much room as the longest one has.
     """
     found = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         array = _whole(column)
         if pa.types.is_dictionary(array.type):
+            _check_text(array.dictionary, name, len(array))
             array = array.dictionary_decode()
         if pa.types.is_string(array.type) or pa.types.is_large_string(array.type):
+            _check_text(array, name, len(array))
             found[name] = np.array(pc.fill_null(array, "").to_pylist(), dtype=str)
         elif _is_number(array.type):
             found[name] = array.to_numpy(zero_copy_only=False)
@@ -108,6 +114,14 @@ def columns_of_table(table: pa.Table) -> dict[str, np.ndarray]:
         if name in found and found[name].dtype == object:
             found[name] = np.array([np.nan if value is None else value for value in found[name]], dtype=float)
     return found
+
+
+def _check_text(array: pa.Array, name: str, rows: int) -> None:
+    if pa.types.is_string(array.type) or pa.types.is_large_string(array.type):
+        longest = pc.call_function("max", [pc.call_function("utf8_length", [array])]).as_py() or 0
+        if 4 * longest * rows > allowance():
+            got = f"{rows:,} rows of text, of which one has {longest:,} characters"
+            raise CandidateError("table", name, got, "shorter text (see --read-limit, or --run FOLDER)")
 
 
 def _arrays(table: pa.Table, name: Path | str) -> dict[str, np.ndarray]:

@@ -26,6 +26,23 @@ program()
 """
 
 
+# What is unfinished takes long to remove, and the command fails meanwhile, since it is gone.
+FAILING = """
+import sys, threading, time
+from jaxgrasp import storage
+from jaxgrasp.cli import program, start
+from jaxgrasp.cli.errors import CommandError
+removed = threading.Event()
+storage.discard_unfinished = lambda: (removed.set(), time.sleep(1.0))
+def fail(arguments):
+    print("begun", flush=True)
+    removed.wait()
+    raise CommandError("--output: cannot be written")
+start._answer = fail
+program()
+"""
+
+
 def begun(*arguments: str, program: str | None = None, **options) -> subprocess.Popen:
     command = COMMAND if program is None else [sys.executable, "-c", program]
     return subprocess.Popen(
@@ -62,6 +79,16 @@ def test_a_signal_before_anything_is_finished_ends_it_at_once(grasps, command, n
     assert complaint == f"jaxgrasp: {word}, nothing was written\n"
     assert time.monotonic() - sent < 10.0
     assert os.listdir(grasps) == ["grasps.npz"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_fails_while_a_signal_ends_the_command_is_not_told(number):
+    process = begun(program=FAILING)
+    assert process.stdout.readline() == "begun\n"
+    process.send_signal(number)
+    complaint = process.communicate(timeout=60)[1]
+    assert process.returncode == 128 + number
+    assert complaint.endswith("nothing was written\n") and complaint.count("\n") == 1
 
 
 def test_what_is_finished_is_kept_after_sigterm(grasps):

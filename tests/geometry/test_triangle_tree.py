@@ -87,6 +87,27 @@ def test_every_distance_is_that_of_the_nearest_triangle(name):
     assert sure.sum() > 150
 
 
+@pytest.mark.parametrize("name", ["ball", "fan", "tetrahedron", "torn"])
+def test_points_by_themselves_and_in_blocks_are_as_far_away(name, monkeypatch):
+    vertices, faces = SURFACES[name]()
+    points = vertices.min(0) + DRAW.uniform(-0.2, 1.2, (3000, 3)) * np.ptp(vertices, axis=0)
+    found = []
+    for size in (1, BLOCK):
+        monkeypatch.setattr(TriangleTree, "blocks_for_nearest", lambda _, given, size=size: Blocks.of(given, size))
+        found.append(Mesh(vertices=vertices, faces=faces).signed_distance(points))
+    np.testing.assert_allclose(*found, atol=ROUNDING * np.ptp(vertices, axis=0).max())
+
+
+def test_small_leaves_are_for_points_by_themselves():
+    points = np.stack(np.meshgrid(*3 * [np.linspace(-0.5, 0.5, 20)]), -1).reshape(-1, 3).astype(np.float32)
+    sizes = []
+    for subdivisions in (2, 6):
+        ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+        tree = TriangleTree(ball.vertices, ball.faces)
+        sizes.append(tree.blocks_for_nearest(points).points.shape[1])
+    assert sizes == [BLOCK, 1]
+
+
 @pytest.mark.parametrize("count", [1, LEAF, LEAF + 1, 5 * LEAF, 1000])
 @pytest.mark.parametrize("points", [1, BLOCK, BLOCK + 1, 300])
 def test_every_triangle_counts_once_for_every_block(count, points):

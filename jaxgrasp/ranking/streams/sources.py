@@ -166,7 +166,7 @@ def source_of(name: str, given: Given) -> Source:
             schema, rows = _schema(stream, name, kind, size)
             sample, travelling = candidates_of_table(schema.empty_table(), name, **vars(given))
             names, travelling = schema.names, travelling.schema
-            if not rows:
+            if rows < 1:
                 raise FileError(name, "positions", "no candidates", "at least one")
     keys = _keys(name, {*names, *FIELDS})
     travelling = pa.schema([*travelling, *((key, pa.string()) for key, _ in keys)])
