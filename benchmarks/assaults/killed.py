@@ -187,9 +187,13 @@ def killed(name: str, rows: int, count: int, folder: Path, draw: random.Random) 
     home = folder / name.replace(" ", "_") / "jaxgrasp" / "kernels"
     home.mkdir(mode=0o700, parents=True)
     path = home / (ending if ending[:1].isdigit() else f"file{ending}")
-    begun = time.perf_counter()
-    os.waitpid(forked(lambda: write(path)), 0)
-    length = time.perf_counter() - begun
+    lengths = []
+    # The first one may take long for other reasons.
+    for _ in range(3):
+        begun = time.perf_counter()
+        os.waitpid(forked(lambda: write(path)), 0)
+        lengths.append(time.perf_counter() - begun)
+    length = min(lengths)
     assert is_whole(path), name
     outcomes = {"old": 0, "new": 0, "broken": 0, "gone": 0}
     littered = 0
