@@ -39,9 +39,10 @@ def rotate(quaternion: Float[np.ndarray, "*batch 4"], vector: Float[np.ndarray, 
 
 
 def unit(pose: Float[np.ndarray, "*batch 7"]) -> np.ndarray:
-    """The pose with its quaternion at length one; that of a zero quaternion is not a number."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        turn = pose[..., 3:] / np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+    """The pose with its quaternion at length one; that of a zero quaternion, or of a huge one, is not a number."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        length = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+        turn = np.where(np.isfinite(length), pose[..., 3:] / length, np.nan)
     return np.concatenate([pose[..., :3], turn], -1)
 
 

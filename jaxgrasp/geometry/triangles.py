@@ -28,7 +28,7 @@ _ARCTAN = (
 )
 
 # Bytes of what may be read for each pair of a point and a leaf that are looked at: 27 million of them, which take less
-# than ten seconds. A surface of a million even triangles makes 23 million.
+# than ten seconds. A surface of a million even triangles makes 18 million.
 _OF_PAIR = 80
 
 Vector = Sequence[Array] | Array

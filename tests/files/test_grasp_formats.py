@@ -367,3 +367,9 @@ def test_joints_get_the_names_of_the_hand(names, hand, wanted):
     # Each test that turns the order round names the first joint of the file last in the hand.
     turned = hand in {("b", "c", "a"), ("thj1", "ffj0"), ("joint_0.0", "joint_13.0")}
     assert found.stages["grasp"].joints[0].tolist() == ([1.0, 0.0] if turned else [0.0, 1.0])
+
+
+def test_a_quaternion_of_no_length_or_a_huge_one_is_no_turn():
+    for scale in (0.0, 1e300):
+        pose = f.unit(np.array([1.0, 2.0, 3.0, 0.0, scale, 0.0, 0.0]))
+        assert pose[:3].tolist() == [1.0, 2.0, 3.0] and np.isnan(pose[3:]).all()
