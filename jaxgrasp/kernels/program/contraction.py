@@ -14,6 +14,8 @@ from jaxgrasp.kernels.program.expressions import Value
 
 # Sums of more terms are cut in two, also for the sake of rounding.
 _LONGEST = 16
+# Chains whose later half is only subtracted are cut above this, before Python's recursion ends.
+_DEEPEST = 200
 # A scalar, and whether it is added rather than subtracted.
 Term = tuple[Any, bool]
 
@@ -135,6 +137,9 @@ def _last_addition(terms: list[Term], like: Value, chained: list[Value]) -> tupl
             _add_in_turn(terms[:half], like, chained),
             _add_in_turn(_positive_first(terms[half:]), like, chained),
         )
+    if len(terms) > _DEEPEST:
+        subtracted = [(x, True) for x, _ in terms[half:]]
+        return "sub", (_add_in_turn(terms[:half], like, chained), _add_in_turn(subtracted, like, chained))
     *before, (last, positive) = terms
     return "add" if positive else "sub", (_add_in_turn(before, like, chained), last)
 
