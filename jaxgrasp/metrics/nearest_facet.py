@@ -27,7 +27,7 @@ class NearestFacet:
     """The largest ball in grasp wrench spaces, and the facet that it touches."""
 
     radius: Float[Array, "*batch"]
-    """See `ferrari_canny`. The distance of the facet, so never too small."""
+    """The distance of the facet, so an upper bound of the ball's radius, see `ferrari_canny`."""
     lower_bound: Float[Array, "*batch"]
     """No facet is nearer than this: where SOLVED at most a share of 5e-8 (float32: 1e-4) below the radius."""
     normal: Float[Array, "*batch 6"]
@@ -124,7 +124,8 @@ def _search(
     points = wrenches.astype(np.float64) / longest[:, None, None]
     values, axes = np.linalg.eigh(np.swapaxes(points, -1, -2) @ points)
     points = points @ axes
-    most = np.where(counted, 1 / np.where(counted, weights, 1), 0)
+    # A tenth more, for the rounding of the weights.
+    most = np.where(counted, 1.1 / np.where(counted, weights, 1), 0)
     reach = np.einsum("nkj,nk->nj", np.abs(points), most) / values
     farthest = 1 / SMALLEST_BALL[dtype.name]
     search = Search(

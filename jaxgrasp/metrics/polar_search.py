@@ -29,7 +29,7 @@ TOLERANCE = {"float64": 1e-7, "float32": 2e-4}
 _CALLS = (256, 8192)
 # Programs of a grasp after which the search ends without a proof.
 _MOST_PROGRAMS = 5_000
-# Programs of an ascent, and the least gain for another one.
+# Programs of an ascent, how much closer than others they are solved, and the least gain for another one.
 _ASCENTS = 12
 _VERTEX = 1e-4
 _GAIN = {"float64": 1e-9, "float32": 1e-5}
@@ -79,7 +79,7 @@ class Search:
         which = np.arange(len(low))
         self._ascend(which, *whole)
         bound, _ = self._largest(which, low, high)
-        left = bound > self._level()
+        left = ~(bound <= self._level())
         which, low, high = _parts_about(which[left], low[left], high[left], self.farthest[left])
         bound, n = self._largest(which, low, high)
         least = np.zeros_like(self.best)
@@ -87,7 +87,7 @@ class Search:
             # Of the boxes that are given up, the bounds count.
             spent = self.programs[which] > _MOST_PROGRAMS
             np.maximum.at(least, which[spent], bound[spent])
-            keep = ~spent & (bound > self._level()[which])
+            keep = ~spent & ~(bound <= self._level()[which])
             which, low, high, bound, n = (x[keep] for x in (which, low, high, bound, n))
             if not len(which):
                 break
@@ -204,17 +204,9 @@ def _cut(low: np.ndarray, high: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, 
 
 
 @compiled
-def _bound(
-    points: jax.Array,
-    counts: jax.Array,
-    low: jax.Array,
-    high: jax.Array,
-    target: jax.Array,
-    level: jax.Array,
-    scale: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Bound target'n over parts of polars in boxes; see `_of_lanes`."""
-    arguments = (points, counts, low, high, target, level, scale)
+def _bound(points: jax.Array, *programs: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Bound target'n over parts of polars in boxes; the arguments of `_of_lanes`, lanes first."""
+    arguments = (points, *programs)
     return map_lanes(
         (lambda all: _of_lanes(*all),),
         arguments,

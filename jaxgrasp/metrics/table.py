@@ -48,9 +48,9 @@ class Metric:
     value: Callable[[Contacts, Setting], Any]
     """(*batch,) of a batch, or a float of one grasp."""
     batched: bool = True
-    """Whether it takes a batch."""
+    """True if `value` takes contacts with batch axes, False if one grasp alone."""
     traceable: bool = True
-    """Whether it can be a part of a caller's `jax.jit`."""
+    """False if `value` runs programs by itself, outside of any `jax.jit`."""
     formulation: str | None = None
     """The formulation of `formulation_margin` whose margin it is."""
     larger_is_better: bool = True

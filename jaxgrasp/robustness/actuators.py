@@ -70,7 +70,7 @@ class ActuatorRows(NamedTuple):
 
 
 def usable_actuation(actuation: Actuation, active: jax.Array) -> jax.Array:
-    """Whether everything that is used is finite, and no limits cross, (*lanes)."""
+    """True where everything that is used is finite and no limits cross, (*lanes)."""
     # A sum is finite where all of its terms are. Spelt out: large reductions are library calls.
     total = lambda x: fold(jnp.add, jnp.abs(x))
     matrices = _by_joints(actuation)[1:]

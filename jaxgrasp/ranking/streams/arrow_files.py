@@ -1,4 +1,4 @@
-"""What files of Arrow declare, before anything of them is inflated.
+"""Reading the sizes that Arrow files declare, before anything is inflated.
 
 pyarrow inflates whatever a batch declares, and has no words for the headers of batches. These are tables of
 FlatBuffers: at a table's beginning stands how far before it the places of its fields are listed.
@@ -19,7 +19,7 @@ _END, _CONTINUES = b"ARROW1", b"\xff\xff\xff\xff"
 
 
 class Declared(NamedTuple):
-    """What a file declares."""
+    """The columns and sizes that an Arrow file declares."""
 
     schema: pa.Schema
     rows: int

@@ -110,7 +110,7 @@ class ScaledProgram:
 
     @property
     def joined(self) -> Joined | None:
-        """How the rows of J'f - B u are joined to those of G; None where all rows are orthonormal."""
+        """The layout of E where the rows of J'f - B u stand below those of G; None where all rows are orthonormal."""
         return Joined(6) if isinstance(self.basis, HandBasis) else None
 
     @property

@@ -33,7 +33,7 @@ _TOGETHER = 5
 
 @dataclass(frozen=True)
 class Joined:
-    """What `kkt` does with the rows E.
+    """The operations of `kkt` with the rows E.
 
     above: the number of rows W.
     """

@@ -291,7 +291,7 @@ class BlockProblem(ABC):
 
     @property
     def _in_turn(self) -> Joined | None:
-        """What eliminates blocks in turn; None where they are at once, as they are where H ties them together."""
+        """The elimination of forces and efforts block by block; None eliminates all blocks at once."""
         return None if any(g.coupled for g in self.groups) else self.joined
 
     def _factor_group(self, g: Blocks, weights: jax.Array) -> Factor:

@@ -95,7 +95,7 @@ class Factors(NamedTuple):
     inverse: jax.Array
     """1 over the weight of group g with the origin, (n, *lanes)."""
     coupling: jax.Array
-    """What sum t <= 1 adds, (*lanes)."""
+    """The factor of the scatter of sum m_g, from the row sum t <= 1, (*lanes)."""
 
 
 @jax.tree_util.register_dataclass
@@ -125,7 +125,7 @@ class BoxedProblem:
 
     @property
     def present(self) -> Rows:
-        """Which rows count: all but those of points that are absent."""
+        """A mask of the rows: 0 for points that are absent, else 1."""
         groups, one = jnp.ones_like(self.heights[:, 0]), jnp.ones_like(self.level)
         six = jnp.ones_like(self.target)
         return Rows(self.counts, groups, one, six, six)
@@ -219,7 +219,8 @@ class BoxedProblem:
         left = self.target - self._pull(z)
         bound = fold(jnp.add, fold(jnp.add, jnp.swapaxes(z * self.heights, 0, 1)))
         bound = bound + jnp.maximum(fold(jnp.maximum, shares), 0) + fold(jnp.add, jnp.abs(left))
-        upper = jnp.minimum(record.upper, bound)
+        # Not the minimum: a bound that is not a number proves nothing.
+        upper = jnp.where(bound < record.upper, bound, record.upper)
         # The value here, once the rows hold, less what they are off; below the level there is no more to know.
         off = jax.tree.map(jnp.abs, residuals.rows)
         missed = reduce_rows(jnp.maximum, off, len(self.lanes))
