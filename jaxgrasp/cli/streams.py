@@ -57,9 +57,10 @@ def notice(message: object) -> None:
 
 
 def tell_notices() -> None:
-    """Prints what was kept, each message as `one_line` does."""
+    """Prints what was kept and was not printed yet, each message as `one_line` does."""
     for message in _notices:
         one_line(message)
+    _notices.clear()
 
 
 @contextlib.contextmanager

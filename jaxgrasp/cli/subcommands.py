@@ -10,9 +10,10 @@ from jaxgrasp.cli.evaluate import Evaluate
 from jaxgrasp.cli.rank import Rank
 from jaxgrasp.cli.squeeze import Squeeze
 from jaxgrasp.cli.synthesize import Synthesize
+from jaxgrasp.cli.view import View
 
 
-def parsed(arguments: Sequence[str] | None) -> Compare | Convert | Evaluate | Rank | Squeeze | Synthesize:
+def parsed(arguments: Sequence[str] | None) -> Compare | Convert | Evaluate | Rank | Squeeze | Synthesize | View:
     """Parses a command line.
 
     Args:
@@ -29,6 +30,7 @@ def parsed(arguments: Sequence[str] | None) -> Compare | Convert | Evaluate | Ra
             "convert": Convert,
             "squeeze": Squeeze,
             "evaluate": Evaluate,
+            "view": View,
         },
         prog="jaxgrasp",
         description="Robustness of multi-fingered grasps, in batch.",

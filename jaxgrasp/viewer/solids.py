@@ -2,7 +2,7 @@
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxgrasp.hands import HandObject
 from jaxgrasp.hands.bodies import bodies_below
@@ -29,10 +29,8 @@ def held_by(hand: HandObject, qpos: Float[np.ndarray, " nq"], engine: str | None
     turn, middle = np.asarray(grasps.object_rotation), np.asarray(grasps.object_position)
 
     def surfaces(bodies: np.ndarray) -> list[np.ndarray]:
-        collide = np.isin(model.geom_bodyid, bodies) & ((model.geom_contype | model.geom_conaffinity) != 0)
-        collide[np.concatenate([model.pair_geom1, model.pair_geom2])] = True
         parts = []
-        for geom in np.flatnonzero(collide & np.isin(model.geom_bodyid, bodies)).tolist():
+        for geom in touching_geoms(model, bodies):
             world = triangles_of(model, geom) @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
             parts.append((world - middle) @ turn)
         return parts
@@ -44,30 +42,45 @@ def held_by(hand: HandObject, qpos: Float[np.ndarray, " nq"], engine: str | None
     )
 
 
+def touching_geoms(model: mujoco.MjModel, bodies: Int[np.ndarray, " bodies"]) -> list[int]:
+    """The geoms of some bodies that can touch, by their numbers."""
+    collide = (model.geom_contype | model.geom_conaffinity) != 0
+    collide[np.concatenate([model.pair_geom1, model.pair_geom2])] = True
+    return np.flatnonzero(collide & np.isin(model.geom_bodyid, bodies)).tolist()
+
+
 def triangles_of(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "triangles 3 3"]:
     """The surface of one geom in its own frame, m, counterclockwise from outside; none of planes and height fields."""
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return _hull(model, int(model.geom_dataid[geom]))
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return _grid(_DRUM, 4, np.pi / 4) * size * [np.sqrt(2), np.sqrt(2), 1]
+        return surface_of_revolution(_DRUM, 4, np.pi / 4) * size * [np.sqrt(2), np.sqrt(2), 1]
     angles = np.linspace(-np.pi / 2, np.pi / 2, _ALONG + 1)
     round_ends = np.stack([np.cos(angles), np.sin(angles)], -1)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return size[0] * _grid(round_ends, _AROUND)
+        return size[0] * surface_of_revolution(round_ends, _AROUND)
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        return size * _grid(round_ends, _AROUND)
+        return size * surface_of_revolution(round_ends, _AROUND)
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         halves = np.repeat(round_ends, [1] * (_ALONG // 2) + [2] + [1] * (_ALONG // 2), 0) * size[0]
         halves[:, 1] += np.repeat([-size[1], size[1]], len(halves) // 2)
-        return _grid(halves, _AROUND)
+        return surface_of_revolution(halves, _AROUND)
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return _grid(_DRUM, _AROUND) * [size[0], size[0], size[1]]
+        return surface_of_revolution(_DRUM, _AROUND) * [size[0], size[0], size[1]]
     return np.zeros((0, 3, 3))
 
 
-def _grid(profile: np.ndarray, around: int, start: float = 0.0) -> np.ndarray:
-    """Triangles of the surface that a profile of (radius, height), from below upwards, makes by turning about z."""
+def surface_of_revolution(
+    profile: Float[np.ndarray, "points 2"], around: int, start: float = 0.0
+) -> Float[np.ndarray, "triangles 3 3"]:
+    """The surface that a profile makes by turning about z, corners counterclockwise from outside.
+
+    Args:
+        profile: Radius and height of points, from below upwards.
+        around: The number of corners of each ring.
+        start: The angle of the first corner, rad.
+    """
     angles = start + 2 * np.pi * np.arange(around + 1) / around
     circle = np.stack([np.cos(angles), np.sin(angles)], -1)
     rings = np.concatenate([profile[:, None, :1] * circle, np.repeat(profile[:, None, 1:], around + 1, 1)], -1)
