@@ -20,6 +20,7 @@ from jaxgrasp.cli.scene import Scene
 from jaxgrasp.cli.setting import Reading, configure_jax, named_disturbances
 from jaxgrasp.cli.streams import printing, tell_notices
 from jaxgrasp.cli.view_exports import export
+from jaxgrasp.cli.view_trials import films, protocols
 
 if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
@@ -170,6 +171,8 @@ class View(Reading):
             cone_edges=self.cone_edges,
             share=self.share,
             bodies=_bodies(candidates, hands) if hands else None,
+            film=films(self.of_hand, candidates) if self.of_hand.hand else None,
+            protocols=protocols() if self.of_hand.hand else (),
         )
         return viewed, hands
 

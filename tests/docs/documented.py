@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 
 from jaxgrasp.cli import main
+from jaxgrasp.cli.subcommands import parsed
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -72,6 +73,9 @@ def execute(command: list[str]) -> None:
     """Run a command of this package here; make sure of other commands that some other test runs what they name."""
     program, *words = command
     match program.removeprefix(".venv/bin/"):
+        case "jaxgrasp" if words[0] == "view" and "--export" not in words:
+            # A page is there until somebody ends it: tests/viewer opens some.
+            assert parsed(words) is not None
         case "jaxgrasp":
             # The command writes to the standard output of its process.
             assert main(words) == 0, command

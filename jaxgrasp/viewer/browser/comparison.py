@@ -72,7 +72,7 @@ class Comparison:
         reach = self._viewed.reach(row)
         stage = Stage(self._scene, "beside", np.array([0.0, _APART * reach, 0.0]))
         if self._viewed.bodies is None:
-            stage.dots("object", self._viewed.surface(row), 0.02 * reach)
+            stage.dots("object", self._viewed.surface(row), reach)
         else:
             stage.draw("bodies", body_shapes(self._viewed.bodies(row)))
         stage.draw("contacts", contact_shapes(found, reach, why.binding))

@@ -77,7 +77,7 @@ class Page:
         viewed, reach = self._viewed, self._viewed.reach(row)
         with self._drawing, self._client.atomic():
             if viewed.bodies is None:
-                self._stage.dots("object", viewed.surface(row), 0.02 * reach)
+                self._stage.dots("object", viewed.surface(row), reach)
             else:
                 shapes = body_shapes(viewed.bodies(row))
                 for kind in ("hand", "object"):

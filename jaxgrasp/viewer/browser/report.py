@@ -46,7 +46,7 @@ def _margin(answer: Answer, unit: str) -> str:
 
 def _contacts(answer: Answer, reasons: Reasons | None) -> str:
     """A row a contact: friction, what it presses with of what it may, and how much of its cone it uses."""
-    head = "".join(f"<th>{name}</th>" for name in ("contact", "friction", "presses [N]", "slides at [N]", "pulls [N]"))
+    head = "".join(f"<th>{name}</th>" for name in ("contact", "friction", "presses [N]", "pulls aside [N]"))
     rows = []
     for number in np.flatnonzero(answer.active).tolist():
         press, friction = -answer.forces[number] @ answer.normals[number], answer.friction[number]
@@ -57,8 +57,7 @@ def _contacts(answer: Answer, reasons: Reasons | None) -> str:
             f"<b style='color:rgb({red},{green},{blue})'>{number}</b>{ends}",
             f"{friction:.3g}",
             f"{press:.3g} of {answer.max_force[number]:.3g}",
-            f"{friction * press:.3g}",
-            f"{across:.3g}",
+            f"{across:.3g} of {friction * press:.3g}",
         )
         rows.append(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
     return f"<table style='{_TABLE}'><tr>{head}</tr>{''.join(rows)}</table>"

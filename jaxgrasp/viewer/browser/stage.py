@@ -11,6 +11,8 @@ from jaxgrasp.viewer.browser.shapes import HAND, OBJECT, Shape
 
 UNITS = 10.0
 """Units of the browser's scene for each m: cameras stand well where a grasp is about one unit large."""
+# Size of dots, in units of the farthest contact's distance from the centre of mass.
+_DOT = 0.012
 
 
 class Stage:
@@ -52,12 +54,14 @@ class Stage:
         for name in before.keys() - self._drawn[kind].keys():
             before[name].remove()
 
-    def dots(self, kind: str, points: Float[np.ndarray, "points 3"], size: float) -> None:
-        """Draws points, m, as dots of a size, m, in place of those of a kind."""
+    def dots(self, kind: str, points: Float[np.ndarray, "points 3"], reach: float) -> None:
+        """Draws points, m, as small dots in place of those of a kind, `reach` m being the size of the grasp."""
         self._kind(kind)
         name = f"/{self._name}/{kind}/all"
-        colours = np.full((len(points), 3), 150, np.uint8)
-        self._scene.add_point_cloud(name, np.asarray(points * UNITS, np.float32), colours, point_size=size * UNITS)
+        colours = np.full((len(points), 3), 185, np.uint8)
+        self._scene.add_point_cloud(
+            name, np.asarray(points * UNITS, np.float32), colours, point_size=_DOT * reach * UNITS, point_shape="circle"
+        )
 
     def bodies(self, kind: str, bodies: Bodies) -> None:
         """Puts hand and object there, in place of those of a kind; `move` moves them."""

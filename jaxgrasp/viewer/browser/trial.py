@@ -71,11 +71,9 @@ class TrialPlayer:
         try:
             film = self._viewed.film(row, self._protocol.value)
         except ValueError as error:
-            self._tell(f"cannot be tried: {error}")
+            self._tell(f"not tried: {error}")
             return
         self._tell(f"{self._viewed.name(row)}: {film.outcome}")
-        if not len(film.time):
-            return
         self._film = film
         self._stage.bodies("bodies", film.bodies)
         self._time.max, self._time.value = max(float(film.time[-1]), 0.01), 0.0

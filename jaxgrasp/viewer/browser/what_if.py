@@ -143,10 +143,12 @@ def reasons(viewed: Viewed, row: int, change: Change) -> Reasons:
     """
     contacts, task = problem(viewed, row, change)
     found = explain(contacts, viewed.disturbances, **task)
-    shares = np.asarray(found.slip + found.press)[0]
+    # A margin of zero has its reason in words: there is no contact to name, and nothing to play.
+    ended = int(found.zero[0]) < 0
+    shares = np.asarray(found.slip + found.press)[0] * ended
     added = blocking_forces(contacts, jnp.nan_to_num(found.direction)[:, None])[0, 0, :, :3]
     turned = np.asarray(jnp.einsum("cij,cj->ci", contacts.frames[0], added))
-    direction = np.asarray(found.direction)[0]
+    direction = np.where(ended, np.asarray(found.direction)[0], np.nan)
     return Reasons(
         words=tuple(found.words(0)),
         binding=int(shares.argmax()) if shares.max() > 0 else None,
