@@ -27,9 +27,10 @@ def test_gltf_is_read_by_another(folder):
     names = set(scene.graph.nodes)
     assert {"grasp 1", "grasp 2"} <= names
     assert {"contacts/0", "cones/3", "forces/2", "worst/force"} <= {re.sub(r"_\d+$", "", name) for name in names}
-    # Contacts are 30 mm from the centre; cones stand outside them by half of that.
+    # Contacts are 30 mm from the centre, in the object's plane of x and y, which is glTF's of x and -z.
     low, high = scene.bounds
-    assert 0.03 < high[1] < 0.06 and low[0] < -0.03 and high[0] > 0.105 + 0.03
+    assert low[0] < -0.03 and high[0] > 0.105 + 0.03 and low[2] < -0.03 and high[2] > 0.03
+    assert -0.02 < low[1] < high[1] < 0.02
     for mesh in scene.geometry.values():
         assert np.isfinite(mesh.vertices).all() and len(mesh.faces)
 

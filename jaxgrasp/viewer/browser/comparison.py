@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxgrasp.viewer.browser.latest import Latest
 from jaxgrasp.viewer.browser.report import report
@@ -14,6 +15,8 @@ from jaxgrasp.viewer.browser.what_if import Answer, Change, Reasons, answer, rea
 
 # How far it stands from the first, in units of the farthest contact's distance from the centre of mass.
 _APART = 3.5
+# To the right as one first looks at it.
+_ASIDE = np.array([-0.6, 0.8, 0.0])
 
 
 class Comparison:
@@ -39,6 +42,11 @@ class Comparison:
             self._said = gui.add_html("")
         for handle in (self._shown, self._place):
             handle.on_update(lambda event: event.client and follow())
+
+    @property
+    def offset(self) -> Float[np.ndarray, "3"] | None:
+        """Where its centre of mass stands, m; None where there is none."""
+        return None if self._found is None else _ASIDE * _APART * self._viewed.reach(self._found[0])
 
     def scale(self) -> float:
         """N for each m with which its forces are drawn; 0 without any."""
@@ -70,7 +78,7 @@ class Comparison:
     def _set_up(self, row: int, found: Answer, why: Reasons) -> Stage:
         """Draws all but the forces."""
         reach = self._viewed.reach(row)
-        stage = Stage(self._scene, "beside", np.array([0.0, _APART * reach, 0.0]))
+        stage = Stage(self._scene, "beside", _ASIDE * _APART * reach)
         if self._viewed.bodies is None:
             stage.dots("object", self._viewed.surface(row), reach)
         else:

@@ -28,6 +28,8 @@ from jaxgrasp.viewer.browser.what_if import Answer, Reasons, answer, reasons
 _SECONDS, _PICTURE = 4.0, 0.05
 # Where the camera stands, in units of the farthest contact's distance from the centre of mass.
 _CAMERA = np.array([3.2, 2.4, 2.0])
+# Times as far where there is a hand.
+_FARTHER = 1.6
 _KINDS = ("hand", "object", "contacts", "forces", "disturbance", "numbers")
 
 
@@ -56,7 +58,7 @@ class Page:
             self._said = gui.add_html("")
             self._play = gui.add_button("play the worst disturbance")
         self._controls = Controls(gui, viewed, self._follow)
-        self._beside = Comparison(gui, client.scene, viewed, self._list.row_at, self._draw)
+        self._beside = Comparison(gui, client.scene, viewed, self._list.row_at, self._show_both)
         self._trial = None
         if viewed.film is not None:
             self._trial = TrialPlayer(gui, client.scene, viewed, lambda: self._list.row, self._stage, self._closed)
@@ -83,9 +85,15 @@ class Page:
                 for kind in ("hand", "object"):
                     self._stage.draw(kind, [shape for shape in shapes if shape.name.startswith(kind)])
         if self._found is None:
-            self._client.camera.position = _CAMERA * reach * UNITS
-            self._client.camera.look_at = np.zeros(3)
+            self._look()
         self._follow()
+
+    def _look(self) -> None:
+        """Turns the camera to the grasp, or to two of them."""
+        beside = self._beside.offset
+        distance = self._viewed.reach(self._list.row) * (1.0 if self._viewed.bodies is None else _FARTHER)
+        self._client.camera.position = (_CAMERA * distance * (1.0 if beside is None else _FARTHER)) * UNITS
+        self._client.camera.look_at = np.zeros(3) if beside is None else 0.5 * beside * UNITS
 
     def _solve(self) -> None:
         row, change = self._list.row, self._controls.change
@@ -123,6 +131,10 @@ class Page:
             ends = lambda number: f"{number} ends the margin" if number == binding else str(number)
             self._stage.label("numbers", [(ends(number), places[number]) for number in here])
             self._beside.draw(scale)
+
+    def _show_both(self) -> None:
+        self._look()
+        self._draw()
 
     def _play_worst(self) -> None:
         """The disturbance grows to the share of the margin and ends again; the fingers answer it."""

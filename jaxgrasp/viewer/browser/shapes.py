@@ -20,8 +20,10 @@ HAND, OBJECT, BINDING, DISTURBANCE, LOAD = (
     (0.10, 0.10, 0.10),
     (0.45, 0.30, 0.65),
 )
+# Of hand and object: what is in them and behind them is seen.
+OPACITY = 0.65
 # Sizes in units of the farthest contact's distance from the centre of mass.
-_CONE, _BALL, _LONGEST, _WORST = 0.5, 0.045, 0.9, 0.8
+_CONE, _BALL, _LONGEST, _WORST = 0.5, 0.045, 0.9, 1.6
 _SHAFT, _HEAD, _HEAD_LENGTH = 0.018, 0.05, 0.14
 _AROUND = 20
 _ARC = np.linspace(-np.pi / 2, np.pi / 2, 9)
@@ -119,7 +121,7 @@ def load_shape(force: Float[np.ndarray, "3"], reach: float, name: str = "load") 
     size = np.linalg.norm(force)
     if not size > 0:
         return None
-    return Shape(name=name, triangles=arrow_between(np.zeros(3), 0.7 * reach * force / size, reach), colour=LOAD)
+    return Shape(name=name, triangles=arrow_between(np.zeros(3), 1.4 * reach * force / size, reach), colour=LOAD)
 
 
 def body_shapes(bodies: Bodies) -> list[Shape]:
@@ -129,7 +131,7 @@ def body_shapes(bodies: Bodies) -> list[Shape]:
             name=f"{'object' if of_object else 'hand'}/{name}",
             triangles=surface,
             colour=OBJECT if of_object else HAND,
-            opacity=1.0 if of_object else 0.6,
+            opacity=OPACITY,
         )
         for name, of_object, surface in zip(bodies.names, bodies.of_object, bodies.surfaces, strict=True)
     ]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxgrasp.viewer.bodies import Bodies
-from jaxgrasp.viewer.browser.shapes import HAND, OBJECT, Shape
+from jaxgrasp.viewer.browser.shapes import HAND, OBJECT, OPACITY, Shape
 
 UNITS = 10.0
 """Units of the browser's scene for each m: cameras stand well where a grasp is about one unit large."""
@@ -73,8 +73,7 @@ class Stage:
         for number, (name, of_object) in enumerate(zip(bodies.names, bodies.of_object, strict=True)):
             part = f"/{self._name}/{kind}/{'object' if of_object else 'hand'} {name}"
             frame = self._scene.add_frame(part, show_axes=False)
-            colour, opacity = (OBJECT, 1.0) if of_object else (HAND, 0.6)
-            self._mesh(f"{part}/surface", bodies.triangles[number], colour, opacity)
+            self._mesh(f"{part}/surface", bodies.triangles[number], OBJECT if of_object else HAND, OPACITY)
             self._drawn[kind][part] = frame
             self._moving.append(frame)
         self.move(bodies, 0)

@@ -69,7 +69,7 @@ class Reasons:
     words: tuple[str, ...]
     """The same in words, see `Explanation.words`."""
     binding: int | None
-    """The contact with the largest part in it; None where no contact ends the margin."""
+    """The contact with the largest part in it; None where no contact ends it, or the actuators do more than any."""
     direction: Float[np.ndarray, "6"]
     """The worst disturbance of the set, N and N m, object frame; NaN where there is none."""
     answers: Float[np.ndarray, "contacts 3"]
@@ -146,12 +146,13 @@ def reasons(viewed: Viewed, row: int, change: Change) -> Reasons:
     # A margin of zero has its reason in words: there is no contact to name, and nothing to play.
     ended = int(found.zero[0]) < 0
     shares = np.asarray(found.slip + found.press)[0] * ended
+    most = max(float(found.actuators[0]), 1e-6)
     added = blocking_forces(contacts, jnp.nan_to_num(found.direction)[:, None])[0, 0, :, :3]
     turned = np.asarray(jnp.einsum("cij,cj->ci", contacts.frames[0], added))
     direction = np.where(ended, np.asarray(found.direction)[0], np.nan)
     return Reasons(
         words=tuple(found.words(0)),
-        binding=int(shares.argmax()) if shares.max() > 0 else None,
+        binding=int(shares.argmax()) if shares.max() > most else None,
         direction=direction,
         answers=np.where(np.isfinite(direction).all(), turned, np.nan),
     )
