@@ -51,6 +51,7 @@ def rates() -> list[str]:
             "min_weight": metrics.min_weight,
             "force_closure": metrics.force_closure,
             "closure_residual": metrics.closure_residual,
+            "task_wrench": lambda c: metrics.task_wrench(c, task),
         }
         jobs: dict[str, Job] = {
             name: functools.partial(run, jax.jit(program), contacts) for name, program in programs.items()
@@ -106,6 +107,31 @@ def answers(W: np.ndarray) -> np.ndarray:
     return np.where(singular[:, 5] <= RANK * singular[:, 0], np.minimum(least, 0), least)
 
 
+def factors(W: np.ndarray) -> np.ndarray:
+    """The largest factors of unit forces that grasps (k, m, 6) exert, by HiGHS: the least of six programs each."""
+    m = W.shape[1]
+    # z >= 0, s >= 0:  W'z = s c,  1'z <= 1.
+    blocks = [np.column_stack([w.T, -wrench]) for w in W for wrench in np.concatenate([np.eye(6)[:3], -np.eye(6)[:3]])]
+    total = [np.append(np.ones(m), 0)[None]] * len(blocks)
+    found = linprog(
+        np.tile(np.append(np.zeros(m), -1), len(blocks)),
+        sp.block_diag(total, "csr"),
+        np.ones(len(blocks)),
+        sp.block_diag(blocks, "csc"),
+        np.zeros(6 * len(blocks)),
+        method="highs",
+        options=HIGHS,
+    )
+    if found.status == 0:
+        return found.x.reshape(len(W), 6, m + 1)[..., -1].min(-1)
+    return np.full(1, np.nan) if len(W) == 1 else np.concatenate([factors(w[None]) for w in W])
+
+
+def tasks(W: np.ndarray) -> np.ndarray:
+    """`factors`, a few grasps at a time."""
+    return np.concatenate([factors(W[i : i + TOGETHER // 4]) for i in range(0, len(W), TOGETHER // 4)])
+
+
 def radii(W: np.ndarray) -> np.ndarray:
     """The largest balls of grasps (k, m, 6) by Qhull; 0 where the wrenches do not span the space."""
     found = np.zeros(len(W))
@@ -123,13 +149,16 @@ def checks(count: int) -> list[str]:
     W = np.asarray(metrics.edge_wrenches(contacts, space)).reshape(count, -1, 6)
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
         parts = [W[i : i + CHUNK] for i in range(0, count, CHUNK)]
-        least, balls = (np.concatenate(list(pool.map(answer, parts))) for answer in (answers, radii))
+        least, balls, forces = (np.concatenate(list(pool.map(answer, parts))) for answer in (answers, radii, tasks))
     found = jax.tree.map(np.asarray, metrics.force_closure(contacts, space))
     ours, finite = found.min_weight * W.shape[1], np.isfinite(least)
     assert (ours[~finite] == least[~finite]).all()
     difference = np.abs(ours - least)[finite]
     relative = difference / np.maximum(np.abs(least[finite]), 1e-2)
     wrong = (found.closed != (least > 1e-7)).sum()
+    exerted = np.asarray(metrics.task_wrench(contacts, jg.DisturbanceSet.forces(1.0), space))
+    answered = ~np.isnan(forces)
+    factor = np.abs(exerted - forces)[answered] / np.maximum(forces[answered], 1e-2)
     facets = jax.tree.map(np.asarray, metrics.nearest_facet(contacts, space=space))
     some = balls > SMALLEST * np.linalg.norm(W, axis=-1).max(-1)
     assert (facets.radius[~some] <= 2 * SMALLEST * np.linalg.norm(W[~some], axis=-1).max(-1)).all()
@@ -140,6 +169,11 @@ def checks(count: int) -> list[str]:
         f"unsolved. Min-weights, times the number of edges, differ by at most {np.nanmax(difference):.1e}, and by "
         f"{np.nanmax(relative):.1e} of the larger of themselves and 0.01. `force_closure` differs on {wrong} of them "
         "from HiGHS' min-weight above 1e-7.",
+        "",
+        f"`task_wrench` of six forces is positive for {(exerted > 0).mean():.0%} and unsolved for "
+        f"{np.isnan(exerted).sum()}; it differs by at most {np.nanmax(factor):.1e} of the larger of itself and 0.01 on "
+        f"the {answered.sum():,} for which HiGHS has an answer, and is 0 where HiGHS is below 1e-9 on all but "
+        f"{((exerted == 0) != (forces < 1e-9))[answered].sum()}.",
         "",
         f"`ferrari_canny` proves its answer on {(facets.status == jg.Status.SOLVED).sum():,} of them. It differs from "
         f"Qhull's by at most {apart.max():.1e} of itself, and its lower bound is at most {low.max():.1e} below; where "

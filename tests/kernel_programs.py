@@ -99,13 +99,13 @@ def specified(dtype, kind):
     return jg.specified_disturbances(contacts, vertices, kind, load)
 
 
-def measured(dtype, metric, n_c=4, cone_edges=4, torsion=None, families=FAMILIES, moved=lambda c: c):
+def measured(dtype, metric, n_c=4, cone_edges=4, torsion=None, families=FAMILIES, moved=lambda c: c, **options):
     """One of the field's metrics; every other contact is soft where there is torsion."""
     contacts = harness.data_of(batch(n_c, families), dtype)[0]
     if torsion is not None:
         arms = torsion * contacts.friction * jnp.asarray(np.arange(n_c) % 2, dtype)
         contacts = replace(contacts, torsional_friction=arms)
-    return metric(moved(contacts), jg.metrics.WrenchSpace(cone_edges=cone_edges))
+    return metric(moved(contacts), space=jg.metrics.WrenchSpace(cone_edges=cone_edges), **options)
 
 
 def gradient_of_metric(dtype, metric):
@@ -219,6 +219,9 @@ GROUPS: dict[str, dict[str, Program]] = {
         "closure": partial(measured, metric=jg.metrics.force_closure),
         "closure, 3": partial(measured, metric=jg.metrics.force_closure, n_c=3, cone_edges=8),
         "closure, soft": partial(measured, metric=jg.metrics.force_closure, torsion=0.1),
+        "nearest facet": partial(measured, metric=jg.metrics.nearest_facet, norm="L1"),
+        "nearest facet, each finger": partial(measured, metric=jg.metrics.nearest_facet, norm="Linf", n_c=3),
+        "task": partial(measured, metric=partial(jg.metrics.task_wrench, task=jg.DisturbanceSet.forces(1.0))),
         "derivatives of min-weights": partial(gradient_of_metric, metric=jg.metrics.min_weight),
     },
     "derivatives": {

@@ -76,24 +76,27 @@ def over_grasps(
     program: Callable[..., Tree],
     contacts: Contacts,
     space: WrenchSpace | None,
+    *given: jax.Array,
 ) -> Tree:
     """Run a program of columns over a batch of grasps; its results are constants to the derivative.
 
     Args:
-        program: a function of a module, of `Columns`, lanes last.
+        program: a function of a module, of `Columns` and of `given`, lanes last.
         contacts: the grasps.
         space: conventions.
+        given: (*batch, k), more arguments of the program.
 
     Returns:
         The results of the program, leaves (*batch, ...).
     """
-    contacts, space = lax.stop_gradient((contacts, checked(contacts, space)))
+    contacts, space, given = lax.stop_gradient((contacts, checked(contacts, space), given))
     dtype, own = contacts.positions.dtype, len(contacts.batch_shape)
     length = None if space.length is None else as_float("length", space.length, ()).astype(dtype)
     reference = None if space.reference is None else as_float("reference", space.reference, (3,)).astype(dtype)
     batches = {"contacts": contacts.batch_shape}
     batches |= {} if length is None else {"length": length.shape}
     batches |= {} if reference is None else {"reference": reference.shape[:-1]}
+    batches |= {f"argument {k}": x.shape[:-1] for k, x in enumerate(given)}
     batch = broadcast_batch(**batches)
 
     def lanes(x: jax.Array, event: int) -> jax.Array:
@@ -107,10 +110,11 @@ def over_grasps(
             length=None if length is None else lanes(length, 0),
             reference=None if reference is None else lanes(reference, 1),
         ),
+        *(lanes(x, 1) for x in given),
     )
     rows = contacts.n_c * (space.cone_edges + 2 * (contacts.components - 3))
     found = map_lanes(
-        (lambda of_grasp: program(columns_of(*of_grasp)),),
+        (lambda of_grasp: program(columns_of(*of_grasp[:2]), *of_grasp[2:]),),
         arguments,
         jax.tree.map(lambda _: False, arguments),
         rows,

@@ -9,12 +9,12 @@ from jaxgrasp.compiling import compiled
 from jaxgrasp.contact import Contacts
 from jaxgrasp.disturbance import DisturbanceSet
 from jaxgrasp.disturbance.vertices import wrenches_of
-from jaxgrasp.metrics.wrench_space import WrenchSpace, checked, edges_of
+from jaxgrasp.metrics.columns import over_grasps
+from jaxgrasp.metrics.least_weight import CLOSED, least_weight
+from jaxgrasp.metrics.task_gauge import MISSED, task_gauge
+from jaxgrasp.metrics.wrench_space import Edges, WrenchSpace, checked, edges_of
 from jaxgrasp.robustness.chain.members import polytope_of
-from jaxgrasp.solvers import solve_qp
-from jaxgrasp.solvers.status import Status
-
-_ROUNDING = {"float64": 1e-8, "float32": 1e-4}
+from jaxgrasp.solvers.dense.gauge import Gauge, gauge_of
 
 
 def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | None = None) -> Float[Array, "*batch"]:
@@ -22,10 +22,10 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
 
     Borst, Fischer and Hirzinger, "Grasp planning: how to choose a suitable task wrench space" (ICRA 2004); Haschke,
     Steil, Steuwer and Ritter, "Task-oriented quality measures for dextrous grasping" (CIRA 2005). The fingers' normal
-    forces sum up to at most 1 (L1), so the factor is per newton of them. A linear program with seven unknowns for every
-    vertex W_j, whose smallest value counts:
+    forces sum up to at most 1 (L1), so the factor is per newton of them. For every vertex W_j, of which the smallest
+    value counts:
 
-        min nu   over (y, nu)   such that   w_k'y <= nu,   nu >= 0,   W_j'y = 1.
+        max s   over (z, s)   such that   sum z_k w_k = s W_j,   sum z_k <= 1,   z_k >= 0.
 
     It does not depend on the unit of moments, nor on the reference, since the wrenches of the task move along with it.
 
@@ -35,8 +35,9 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
         space: conventions; `WrenchSpace()` where None.
 
     Returns:
-        (*batch,), exactly 0 where some wrench cannot be exerted, inf without any; NaN for data that are not admissible
-        or a program that could not be solved. Differentiable.
+        (*batch,), to 1e-7 of itself (float32: 1e-4), exactly 0 where all but a share of 1e-8 (float32: 1e-4) of some
+        wrench cannot be exerted, inf without any wrench; NaN for data that are not admissible or a program whose two
+        bounds did not meet. Differentiable.
 
     Raises:
         ValueError: a set that is not given by vertices, options or shapes that do not fit.
@@ -55,32 +56,47 @@ def task_wrench(contacts: Contacts, task: DisturbanceSet, space: WrenchSpace | N
 def _scaled(contacts: Contacts, vertices: jax.Array, space: WrenchSpace) -> jax.Array:
     """The least of what the vertices, one by one, may be scaled by."""
     edges = edges_of(contacts, space)
-    W, dtype = edges.flat, edges.wrenches.dtype
+    dtype = edges.wrenches.dtype
     vertices = vertices.astype(dtype)
     batch = broadcast_batch(contacts=edges.valid.shape, task=vertices.shape[:-2])
+    # The vertices' axis goes first.
+    vertices = jnp.moveaxis(jnp.broadcast_to(vertices, (*batch, *vertices.shape[-2:])), -2, 0)
     force, moment = vertices[..., :3], vertices[..., 3:]
     if space.reference is not None:
-        moment = moment - jnp.cross(jnp.asarray(space.reference, dtype)[..., None, :], force)
-    length = edges.length[..., None, None]
-    size = (*batch, vertices.shape[-2], 3)
-    scaled = jnp.concatenate([jnp.broadcast_to(force, size), jnp.broadcast_to(moment / length, size)], -1)
-    valid = jnp.broadcast_to(edges.valid, batch) & jnp.isfinite(scaled).all((-2, -1))
-    counted = jnp.any(scaled != 0, -1) & valid[..., None]
-    wanted = jnp.where(counted[..., None], scaled, jnp.eye(1, 6, dtype=dtype)[0])
-    rows = jnp.concatenate([W, -jnp.ones_like(W[..., :1])], -1)
-    rows = jnp.concatenate([rows, -jnp.eye(1, 7, k=6, dtype=dtype) + jnp.zeros_like(rows[..., :1, :])], -2)
-    equality = jnp.concatenate([wanted, jnp.zeros_like(wanted[..., :1])], -1)[..., None, :]
-    found = solve_qp(
-        None,
-        jnp.zeros(7, dtype).at[6].set(1),
-        equality,
-        jnp.ones(1, dtype),
-        rows[..., None, :, :],
-        jnp.zeros(rows.shape[-2], dtype),
-    )
-    each = jnp.where(found.status == Status.SOLVED, jnp.where(counted, found.objective, 0), jnp.nan)
-    # The solver tells a wrench from zero to this share of the longest one that the fingers can exert.
-    longest = jnp.max(safe_norm(W), -1, initial=0)[..., None]
-    each = jnp.where((each * safe_norm(wanted) <= _ROUNDING[dtype.name] * longest) | (longest == 0), 0, each)
-    value = jnp.min(jnp.where(counted, each, jnp.inf), -1)
-    return jnp.where(valid, value, jnp.nan)
+        moment = moment - jnp.cross(jnp.asarray(space.reference, dtype), force)
+    wanted = jnp.concatenate([force, moment / edges.length[..., None]], -1)
+    valid = edges.valid & jnp.isfinite(wanted).all((0, -1))
+    size = safe_norm(jnp.where(valid[..., None], wanted, 0))
+    wanted = jnp.where((size > 0)[..., None], wanted, 0)
+    gauge = _gauges(contacts, space, edges, wanted)
+    # A wrench is told from zero to this share of the longest one that the fingers can exert.
+    longest = jnp.max(safe_norm(edges.flat), -1, initial=0)
+    exerted = size >= MISSED[dtype.name] * longest * gauge
+    factor = jnp.where(exerted, 1 / jnp.where(exerted & (gauge > 0), gauge, 1), 0)
+    factor = jnp.where(jnp.isnan(gauge), jnp.nan, factor)
+    factor = jnp.where(size > 0, factor, jnp.inf)
+    least = jnp.min(jnp.where(jnp.isnan(factor), jnp.inf, factor), 0, initial=jnp.inf)
+    known = valid & (~jnp.isnan(factor).any(0) | (least == 0))
+    return jnp.where(known, least, jnp.nan)
+
+
+def _gauges(contacts: Contacts, space: WrenchSpace, edges: Edges, wanted: jax.Array) -> jax.Array:
+    """The gauges (vertices, *batch) of wrenches (vertices, *batch, 6); inf where not to be exerted, NaN if unsolved."""
+    dtype = wanted.dtype
+    closure = over_grasps(least_weight, contacts, space)
+    cancels = closure.solved & (1 - closure.gauge > CLOSED[dtype.name])
+    weights = closure.number[..., None] * closure.excess + (1 - closure.gauge)[..., None]
+    balance = jnp.where(cancels[..., None] & edges.counted, weights, 0)
+    # Most wrenches that cannot be exerted do work on a twist that no edge resists.
+    beyond = jnp.zeros(wanted.shape[:-1], bool)
+    for twist in (closure.twist, closure.idle, -closure.idle):
+        work = jnp.where(edges.counted, jnp.sum(edges.flat * twist[..., None, :], -1), 0)
+        resisted, task = jnp.max(work, -1, initial=0), jnp.sum(wanted * twist, -1)
+        # Less work than that is rounding.
+        least = MISSED[dtype.name] * safe_norm(wanted) * safe_norm(twist)
+        beyond |= (task > least) & (resisted <= MISSED[dtype.name] * task)
+    found = over_grasps(task_gauge, contacts, space, jnp.where(beyond[..., None], 0, wanted), balance)
+    usable = found.solved & ~beyond & jnp.isfinite(found.gauge)
+    flat = jnp.broadcast_to(edges.flat, (*usable.shape, *edges.flat.shape[-2:]))
+    value = gauge_of(flat, wanted, Gauge(found.gauge, found.twist, found.shares), usable).value
+    return jnp.where(beyond, jnp.inf, jnp.where(found.solved, value, jnp.nan))

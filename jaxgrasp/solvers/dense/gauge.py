@@ -10,8 +10,8 @@ Every step proves two bounds. Any y proves g >= c'y / max u_k'y, so y is recorde
 points to. Any z that is moved by U'(U U')^-1 (c - U z) attains c, and its sum is an upper bound where it is then not
 negative.
 
-Here the points are balanced: they sum up to zero. Then all may have the same more of z, so both programs have interior
-points to start from, and the bounds are never far.
+Here the points are balanced: with some weights a > 0, all 1 where nothing else is said, they sum up to zero. Then z may
+have any multiple of a more, so both programs have interior points to start from, and the bounds are never far.
 
 Callers scale: U has orthonormal rows, or zeros, before the mean is taken from all points.
 
@@ -109,14 +109,16 @@ class GaugeProblem:
     target: c, (6, *lanes); zero where U has a zero row.
     present: a mask of the points, (m, *lanes): 1 or 0.
     dropped: a mask of the rows of U, (6, *lanes): 1 for rows that are zero, else 0.
-    lean: e with (U U')^-1 = 1 + e e', (6, *lanes).
+    lean: e with (U U')^-1 = 1 + e e', (6, *lanes); None where e is zero.
+    balance: a, (m, *lanes), zero where a point is absent; None where all are 1.
     """
 
     points: jax.Array
     target: jax.Array
     present: jax.Array
     dropped: jax.Array
-    lean: jax.Array
+    lean: jax.Array | None
+    balance: jax.Array | None = None
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -131,8 +133,8 @@ class GaugeProblem:
     def start(self) -> Iterate:
         """Start in the middle of the polar, at multipliers that attain c, raised until they are positive."""
         along = self._multipliers(self.target)
-        lift = _RAISE * fold(jnp.maximum, -along) + _LIFT / jnp.maximum(fold(jnp.add, self.present), 1)
-        z = (along + lift) * self.present
+        lift = _RAISE * self._least_lift(along) + _LIFT / jnp.maximum(fold(jnp.add, self.present), 1)
+        z = self._lifted(along, lift)
         return Iterate(jnp.zeros_like(self.target), (), jnp.ones_like(z), z)
 
     def residuals(self, iterate: Iterate) -> Residuals:
@@ -176,7 +178,7 @@ class GaugeProblem:
         inverse = 1 / jnp.maximum(reach, jnp.finfo(reach.dtype).tiny)
         lower = height * inverse
         z = iterate.z - self._multipliers(residuals.dual) * self.present
-        z = z - jnp.minimum(fold(jnp.minimum, z), 0) * self.present
+        z = self._lifted(z, jnp.maximum(self._least_lift(z), 0))
         upper = fold(jnp.add, z)
         rises, falls = lower > record.lower, upper < record.upper
         return Record(
@@ -188,7 +190,22 @@ class GaugeProblem:
 
     def _multipliers(self, x: jax.Array) -> jax.Array:
         """Compute U'(U U')^-1 x, the least z with U z = x."""
-        return matvec_transposed(self.points, x + self.lean * fold(jnp.add, self.lean * x))
+        if self.lean is not None:
+            x = x + self.lean * fold(jnp.add, self.lean * x)
+        return matvec_transposed(self.points, x)
+
+    def _least_lift(self, z: jax.Array) -> jax.Array:
+        """The least multiple of a with which no z of a point that is there is negative, (*lanes)."""
+        if self.balance is None:
+            return fold(jnp.maximum, -z)
+        there = self.balance > 0
+        return fold(jnp.maximum, jnp.where(there, -z / jnp.where(there, self.balance, 1), -jnp.inf))
+
+    def _lifted(self, z: jax.Array, lift: jax.Array) -> jax.Array:
+        """Compute z + lift a, zero where a point is absent."""
+        if self.balance is None:
+            return (z + lift) * self.present
+        return z * self.present + lift * self.balance
 
 
 class Gauge(NamedTuple):
