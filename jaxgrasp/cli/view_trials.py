@@ -47,10 +47,10 @@ def films(options: "Scene", candidates: "Candidates") -> "Callable[[int, str], F
         given, places = grasps()
         source = candidates.sources[candidates.source[row]]
         alone = given.take(np.array([places[f"{source}:{candidates.index[row]}"]]))
-        assert options.hand is not None and options.object is not None
-        tried = {"hand": options.hand, "object": options.object}
-        found = evaluation.evaluate(alone, **tried, protocol=protocol, workers=1)
-        scene, frames = evaluation.film(found, 0, **tried)
+        hand, object = options.hand, options.object
+        assert hand is not None and object is not None
+        found = evaluation.evaluate(alone, hand=hand, object=object, protocol=protocol, workers=1)
+        scene, frames = evaluation.film(found, 0, hand=hand, object=object)
         if not frames:
             raise ValueError(f"nothing to watch: {found.outcome[0]}")
         bodies = bodies_along(hand_of(scene), np.stack([qpos for _, qpos, _ in frames]))
