@@ -69,12 +69,9 @@ def joined(
     Raises:
         FileError: No row has a candidate.
     """
-    name = lambda text: Path(text).name
-    number = {
-        (name(candidates.sources[source]), index): row
-        for row, (source, index) in enumerate(zip(candidates.source.tolist(), candidates.index.tolist(), strict=True))
-    }
-    wanted = zip(map(name, table["source"].tolist()), table["index"].tolist(), strict=True)
+    sources = [candidates.sources[source] for source in candidates.source.tolist()]
+    number = {key: row for row, key in enumerate(zip(sources, candidates.index.tolist(), strict=True))}
+    wanted = zip(table["source"].tolist(), table["index"].tolist(), strict=True)
     rows = np.array([number.get(key, -1) for key in wanted])
     if (rows < 0).all():
         raise FileError(path, "source", f"rows of {table['source'][0]}", f"rows of {candidates.sources[0]}")

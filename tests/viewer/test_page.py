@@ -85,7 +85,9 @@ class Watched:
     """A page, with what it asked for and complained of."""
 
     def __init__(self, browser, address: str):
-        self.page = browser.new_page(viewport={"width": 1400, "height": 1100})
+        # Small: the processor draws it. Nothing counts as stable before it has drawn two pictures.
+        self.page = browser.new_page(viewport={"width": 1000, "height": 800})
+        self.page.set_default_timeout(PATIENCE)
         self.complaints: list[str] = []
         self.hosts: set[str] = set()
         self.page.on("console", lambda said: said.type == "error" and self.complaints.append(said.text))
@@ -200,12 +202,11 @@ def test_it_shows_the_grasp_that_is_chosen(watched):
 
 def test_it_sorts_by_any_column(watched):
     best = watched.grasp()
-    watched.input("largest first").click()
-    worst = watched.other_grasp(best)
-    assert margin_of(worst) == 0
-    watched.input("sorted by").click()
-    watched.page.get_by_role("option", name="index", exact=True).click()
-    assert watched.other_grasp(worst) == 0
+    watched.input("sorted by").click(force=True)
+    watched.page.get_by_role("option", name="index", exact=True).click(force=True)
+    assert watched.other_grasp(best) == COUNT - 1
+    watched.input("largest first").press("Space")
+    assert watched.other_grasp(COUNT - 1) == 0
     watched.page.get_by_role("button", name="last", exact=True).click()
     watched.page.get_by_text(f"superquadric:{COUNT - 1}", exact=True).wait_for(timeout=PATIENCE)
 
@@ -242,7 +243,7 @@ def test_it_draws(watched, tmp_path):
     def picture(name: str) -> np.ndarray:
         canvas = watched.page.locator("canvas").first
         canvas.screenshot(path=tmp_path / name)
-        return np.asarray(Image.open(tmp_path / name).convert("RGB")).astype(int)[:, :900]
+        return np.asarray(Image.open(tmp_path / name).convert("RGB")).astype(int)[:, :600]
 
     still = picture("still.png")
     red, green, blue = np.moveaxis(still, -1, 0)
@@ -275,7 +276,7 @@ def test_two_browsers_have_pages_of_their_own(browser, address, watched):
 
 def test_two_grasps_stand_side_by_side(watched):
     watched.page.get_by_text("Beside it").click()
-    watched.input("another grasp").click()
+    watched.input("another grasp").press("Space")
     names = watched.page.get_by_text(re.compile(r"^margin [\d.e+-]+ N$"))
     watched.page.wait_for_function(
         "() => [...document.querySelectorAll('b')].filter(b => /^margin .* N$/.test(b.innerText)).length == 2",

@@ -60,9 +60,8 @@ class Controls:
         """Sets all but the share to what a grasp is by itself."""
         self._row, self._own_load = row, load_size(self._viewed, row)
         self._shifts[:] = 0.0
-        self._load.max = max(3.0 * self._own_load, float(self._viewed.candidates.max_force[row].sum()), 0.1)
-        if not np.isfinite(self._load.max):
-            self._load.max = _MOST_LOAD
+        most = max(3.0 * self._own_load, float(self._viewed.candidates.max_force[row].sum()), 0.1)
+        self._load.max = most if np.isfinite(most) else _MOST_LOAD
         self._friction.value, self._load.value = 1.0, self._load_step(self._own_load)
         for slider in self._moves:
             slider.value = 0.0

@@ -50,7 +50,6 @@ class Page:
         self._playing = threading.Lock()
         self._found: tuple[int, Answer, Reasons | None] | None = None
         gui = client.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._stage = Stage(client.scene, "grasp")
         self._follow = Latest(self._solve)
         self._list = GraspList(gui, viewed, self._choose)
