@@ -1,5 +1,7 @@
 """How much of a task the grasp wrench space holds."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -59,29 +61,28 @@ def _scaled(contacts: Contacts, vertices: jax.Array, space: WrenchSpace) -> jax.
     dtype = edges.wrenches.dtype
     vertices = vertices.astype(dtype)
     batch = broadcast_batch(contacts=edges.valid.shape, task=vertices.shape[:-2])
-    # The vertices' axis goes first.
-    vertices = jnp.moveaxis(jnp.broadcast_to(vertices, (*batch, *vertices.shape[-2:])), -2, 0)
     force, moment = vertices[..., :3], vertices[..., 3:]
     if space.reference is not None:
-        moment = moment - jnp.cross(jnp.asarray(space.reference, dtype), force)
-    wanted = jnp.concatenate([force, moment / edges.length[..., None]], -1)
-    valid = edges.valid & jnp.isfinite(wanted).all((0, -1))
-    size = safe_norm(jnp.where(valid[..., None], wanted, 0))
+        moment = moment - jnp.cross(jnp.asarray(space.reference, dtype)[..., None, :], force)
+    size = (*batch, vertices.shape[-2], 3)
+    moment = jnp.broadcast_to(moment, size) / edges.length[..., None, None]
+    wanted = jnp.concatenate([jnp.broadcast_to(force, size), moment], -1)
+    valid = edges.valid & jnp.isfinite(wanted).all((-2, -1))
+    size = safe_norm(jnp.where(valid[..., None, None], wanted, 0))
     wanted = jnp.where((size > 0)[..., None], wanted, 0)
     gauge = _gauges(contacts, space, edges, wanted)
     # A wrench is told from zero to this share of the longest one that the fingers can exert.
-    longest = jnp.max(safe_norm(edges.flat), -1, initial=0)
+    longest = jnp.max(safe_norm(edges.flat), -1, initial=0)[..., None]
     exerted = size >= MISSED[dtype.name] * longest * gauge
     factor = jnp.where(exerted, 1 / jnp.where(exerted & (gauge > 0), gauge, 1), 0)
-    factor = jnp.where(jnp.isnan(gauge), jnp.nan, factor)
-    factor = jnp.where(size > 0, factor, jnp.inf)
-    least = jnp.min(jnp.where(jnp.isnan(factor), jnp.inf, factor), 0, initial=jnp.inf)
-    known = valid & (~jnp.isnan(factor).any(0) | (least == 0))
+    factor = jnp.where(size > 0, jnp.where(jnp.isnan(gauge), jnp.nan, factor), jnp.inf)
+    least = jnp.min(jnp.where(jnp.isnan(factor), jnp.inf, factor), -1, initial=jnp.inf)
+    known = valid & (~jnp.isnan(factor).any(-1) | (least == 0))
     return jnp.where(known, least, jnp.nan)
 
 
 def _gauges(contacts: Contacts, space: WrenchSpace, edges: Edges, wanted: jax.Array) -> jax.Array:
-    """The gauges (vertices, *batch) of wrenches (vertices, *batch, 6); inf where not to be exerted, NaN if unsolved."""
+    """The gauges (*batch, vertices) of wrenches (*batch, vertices, 6); inf where not to be exerted, NaN if unsolved."""
     dtype = wanted.dtype
     closure = over_grasps(least_weight, contacts, space)
     cancels = closure.solved & (1 - closure.gauge > CLOSED[dtype.name])
@@ -91,12 +92,24 @@ def _gauges(contacts: Contacts, space: WrenchSpace, edges: Edges, wanted: jax.Ar
     beyond = jnp.zeros(wanted.shape[:-1], bool)
     for twist in (closure.twist, closure.idle, -closure.idle):
         work = jnp.where(edges.counted, jnp.sum(edges.flat * twist[..., None, :], -1), 0)
-        resisted, task = jnp.max(work, -1, initial=0), jnp.sum(wanted * twist, -1)
+        resisted, task = jnp.max(work, -1, initial=0)[..., None], jnp.sum(wanted * twist[..., None, :], -1)
         # Less work than that is rounding.
-        least = MISSED[dtype.name] * safe_norm(wanted) * safe_norm(twist)
+        least = MISSED[dtype.name] * safe_norm(wanted) * safe_norm(twist)[..., None]
         beyond |= (task > least) & (resisted <= MISSED[dtype.name] * task)
-    found = over_grasps(task_gauge, contacts, space, jnp.where(beyond[..., None], 0, wanted), balance)
+    asked = jnp.where(beyond[..., None], 0, wanted)
+    found = over_grasps(task_gauge, *_by_vertex(contacts, space), asked, balance[..., None, :])
     usable = found.solved & ~beyond & jnp.isfinite(found.gauge)
-    flat = jnp.broadcast_to(edges.flat, (*usable.shape, *edges.flat.shape[-2:]))
+    flat = jnp.broadcast_to(edges.flat[..., None, :, :], (*usable.shape, *edges.flat.shape[-2:]))
     value = gauge_of(flat, wanted, Gauge(found.gauge, found.twist, found.shares), usable).value
     return jnp.where(beyond, jnp.inf, jnp.where(found.solved, value, jnp.nan))
+
+
+def _by_vertex(contacts: Contacts, space: WrenchSpace) -> tuple[Contacts, WrenchSpace]:
+    """Both with an axis for vertices after those of the batch."""
+    own = len(contacts.batch_shape)
+    length, reference = space.length, space.reference
+    return jax.tree.map(lambda x: jnp.expand_dims(x, own), contacts), replace(
+        space,
+        length=None if length is None else jnp.asarray(length)[..., None],
+        reference=None if reference is None else jnp.asarray(reference)[..., None, :],
+    )

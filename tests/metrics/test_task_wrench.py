@@ -94,13 +94,16 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(slope[smooth], central[smooth], atol=1e-5 * np.abs(central[smooth]).max())
 
 
-def test_factors_turn_with_the_object_and_grow_with_friction():
+def test_factors_turn_with_the_object_keep_in_any_unit_and_grow_with_friction():
     contacts = contacts_of()
     before = np.asarray(task(contacts, TASKS["mixed"], SPACE))
     R = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     R *= np.linalg.det(R)
     turned = replace(contacts, positions=contacts.positions @ R.T, frames=R @ contacts.frames)
     np.testing.assert_allclose(before, task(turned, TASKS["mixed"].rotated(R), SPACE), atol=1e-7)
+    rng = np.random.default_rng(1)
+    other = replace(SPACE, length=rng.uniform(0.01, 0.1, COUNT), reference=0.02 * rng.normal(size=(COUNT, 3)))
+    np.testing.assert_allclose(before, task(contacts, TASKS["mixed"], other), atol=1e-7)
     rougher = replace(contacts, friction=contacts.friction + 0.1)
     assert np.all(task(rougher, TASKS["mixed"], SPACE) >= before - 1e-7)
 
