@@ -20,7 +20,6 @@ from PIL import Image
 
 import jaxgrasp as jg
 from jaxgrasp.candidates import sample_grasps
-from jaxgrasp.hands import Scene
 
 pytest.importorskip("viser")
 sync_api = pytest.importorskip("playwright.sync_api")
@@ -272,53 +271,6 @@ def test_two_browsers_have_pages_of_their_own(browser, address, watched):
     assert other.other_grasp(row) != row == watched.grasp()
     other.close()
     watched.settled(margin_of(row, friction))
-
-
-def test_two_grasps_stand_side_by_side(watched):
-    watched.page.get_by_text("Beside it").click()
-    watched.input("another grasp").press("Space")
-    names = watched.page.get_by_text(re.compile(r"^margin [\d.e+-]+ N$"))
-    watched.page.wait_for_function(
-        "() => [...document.querySelectorAll('b')].filter(b => /^margin .* N$/.test(b.innerText)).length == 2",
-        timeout=PATIENCE,
-    )
-    assert names.count() == 2
-
-
-def grasps_of_a_ball(path: Path) -> None:
-    """Fingers bent inwards until they touch a ball of 5 cm."""
-    scene = Scene.build(hand="four_fingers", object="sphere", scale=0.05)
-    count = 3
-    # Tips of 8 mm at the end of fingers of 105 mm, whose roots are 60 mm from the axis.
-    bent = np.arcsin((0.06 - 0.033) / 0.105) + 0.001 * np.arange(count)
-    joints = np.zeros((count, len(scene.joint_names)))
-    joints[:, [name.endswith("flex1") for name in scene.joint_names]] = bent[:, None]
-    base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (count, 1))
-    np.savez(
-        path,
-        grasp_qpos=np.concatenate([base, joints], -1),
-        obj_pose=np.tile([0.0, 0, 0.1, 1, 0, 0, 0], (count, 1)),
-        obj_scale=np.full(count, 0.05),
-        joint_names=np.array(scene.joint_names),
-    )
-
-
-def test_a_trial_of_a_hand_is_played(browser, tmp_path):
-    grasps_of_a_ball(tmp_path / "grasps.npz")
-    hand = ["--hand", "four_fingers", "--object", "sphere", "--grasps", "grasps.npz"]
-    server, address = started(tmp_path, *hand)
-    page = Watched(browser, address)
-    page.page.get_by_text("ends where").first.wait_for(timeout=PATIENCE)
-    page.page.get_by_text("Trial in MuJoCo").click()
-    page.page.get_by_role("button", name="try this grasp").click()
-    page.page.get_by_text(re.compile(r"^grasps\.npz:\d: (held|lost)$")).wait_for(timeout=PATIENCE)
-    moment = page.input("time [s]").get_by_role("slider")
-    before = float(moment.get_attribute("aria-valuenow"))
-    time.sleep(1)
-    assert float(moment.get_attribute("aria-valuenow")) > before
-    page.page.get_by_role("button", name="back to the grasp").click()
-    page.close()
-    ended(server)
 
 
 def test_the_address_is_this_machines(tmp_path):
