@@ -35,9 +35,17 @@ def margin(normals):
     return jg.largest_disturbance(contacts(normals), pushes).margin
 def slope(normals):
     return jax.grad(lambda n: jnp.nan_to_num(margin(n)).sum())(normals)
+def slope_of_contacts(normals):
+    # Frames are constants: how tangents follow from normals has changed, and is no kernel's work.
+    frames = known[normals.dtype.name]
+    def total(positions, frames):
+        moved = jg.Contacts.from_frames(positions, frames, friction=0.5, max_force=1.0)
+        return jnp.nan_to_num(jg.largest_disturbance(moved, pushes).margin).sum()
+    return jax.grad(total, (0, 1))(0.05 * normals, frames)
 def effort(normals):
     return jg.least_effort(contacts(normals), pushes, 0.1).effort
-programs = {"margin": margin, "gradient": slope, "effort": effort}
+known = {dtype: contacts(jnp.asarray(normals, dtype)).frames for dtype in ("float64", "float32")}
+programs = {"margin": margin, "gradient": slope, "gradient by contacts": slope_of_contacts, "effort": effort}
 ready = {}
 for dtype in ("float64", "float32"):
     given = jnp.asarray(normals, dtype)
