@@ -2,6 +2,7 @@
 
 import functools
 import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxgrasp.geometry.grid import DistanceGrid
 from jaxgrasp.geometry.mesh_files import BYTE, TRIANGLE, read_triangles
+from jaxgrasp.geometry.mesh_repair import mended
 from jaxgrasp.geometry.triangle_tree import TriangleTree
 from jaxgrasp.geometry.triangles import signed_distances
 from jaxgrasp.storage import FileError, allowance, open_regular, printable, reason_of
@@ -19,6 +21,10 @@ MESH_ENDINGS = (".stl", ".obj", ".ply")
 _MARGIN = 4
 # Nodes nearer to the surface than 1.5 sqrt(3) spacings take part in look-ups on it; the rest is for those beside it.
 _BAND = 3.5
+# Nodes of the grid by which volume and centre of what is not closed are found.
+_SOLID_NODES = 100_000
+# Extents between which objects for hands are, m; others are likely in millimetres, or in metres taken for these.
+_SMALLEST, _LARGEST, _PER_MILLI = 1e-3, 10.0, 1e-3
 
 
 class MeshError(ValueError):
@@ -37,17 +43,23 @@ class Mesh:
     """m."""
     faces: Int[np.ndarray, "triangles 3"]
     """Indices of the corners."""
+    is_closed: bool = False
+    """Whether it is known to be one part without holes; volume and centroid then follow from the triangles alone."""
 
     @classmethod
     def from_arrays(cls, vertices: np.ndarray, faces: np.ndarray) -> "Mesh":
         """A mesh of given triangles.
+
+        Those that disagree with their neighbours, and parts that are inside out, are turned; triangles that are there
+        twice, and parts without area, are left out.
 
         Args:
             vertices: (vertices, 3), m.
             faces: (triangles, 3), indices.
 
         Raises:
-            MeshError: not a mesh: other shapes, nothing in it, not finite, indices out of range, or flat.
+            MeshError: not a mesh: other shapes, nothing in it, not finite, indices out of range, flat, or with one side
+                alone.
         """
         vertices, faces = np.asarray(vertices, float), np.asarray(faces)
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
@@ -58,15 +70,21 @@ class Mesh:
             raise MeshError(f"got faces that are no indices of the {len(vertices)} vertices, wanted 0 to V - 1")
         if not np.isfinite(vertices).all():
             raise MeshError("got vertices that are not finite, wanted finite ones")
-        mesh = cls(vertices=vertices, faces=faces)
-        if not abs(mesh.volume) > 1e-9 * np.ptp(mesh.triangles, axis=(0, 1)).max() ** 3:
-            raise MeshError(f"got a surface around {mesh.volume:.3g} m^3, wanted one around a solid")
-        # Some programs write the corners clockwise.
-        return mesh if mesh.volume > 0 else cls(vertices=vertices, faces=faces[:, ::-1])
+        try:
+            faces, is_closed = mended(vertices, faces)
+        except ValueError as error:
+            raise MeshError(str(error)) from None
+        mesh = cls(vertices=vertices, faces=faces, is_closed=is_closed)
+        volume = float(mesh._tetrahedra()[0].sum())
+        if not abs(volume) > 1e-9 * np.ptp(mesh.triangles, axis=(0, 1)).max() ** 3:
+            raise MeshError(f"got a surface around {volume:.3g} m^3, wanted one around a solid")
+        return mesh
 
     @classmethod
     def from_file(cls, path: Path | str, scale: float = 1.0) -> "Mesh":
         """Reads a mesh, `.stl`, `.obj` or `.ply`; all its parts become one.
+
+        An extent that no object for a hand has gets a warning with the scale that is likely.
 
         Args:
             path: the file.
@@ -87,9 +105,17 @@ class Mesh:
         except (ValueError, LookupError, OverflowError, struct.error, Warning) as error:
             raise MeshError(f"{path}: got damaged data ({reason_of(error)}), wanted an intact mesh") from error
         try:
-            return cls.from_arrays(scale * vertices, faces)
+            mesh = cls.from_arrays(scale * vertices, faces)
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
+        extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max())
+        if not _SMALLEST <= extent <= _LARGEST:
+            factor = scale * (_PER_MILLI if extent > _LARGEST else 1 / _PER_MILLI)
+            warnings.warn(
+                printable(f"jaxgrasp: {path}: got an object {extent:g} m wide; its scale is likely {factor:g}"),
+                stacklevel=2,
+            )
+        return mesh
 
     @property
     def triangles(self) -> Float[np.ndarray, "triangles 3 3"]:
@@ -98,14 +124,17 @@ class Mesh:
 
     @property
     def volume(self) -> float:
-        """Of the solid inside, m^3; negative where the triangles are clockwise."""
-        return float(self._tetrahedra()[0].sum())
+        """Of the solid that the signed distances describe, m^3."""
+        return self._solid[0]
 
     @property
     def centroid(self) -> Float[np.ndarray, "3"]:
-        """Centre of the solid's volume, its centre of mass where it is of one material, m."""
-        volumes, centres = self._tetrahedra()
-        return volumes @ centres / volumes.sum()
+        """Centre of the solid's volume, its centre of mass where it is of one material, m.
+
+        Raises:
+            MeshError: too many triangles are long or overlap.
+        """
+        return self._solid[1]
 
     def signed_distance(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
         """Exact signed distances to all triangles, see `triangles.signed_distances`.
@@ -130,11 +159,9 @@ class Mesh:
         """
         if nodes < 1000:
             raise ValueError(f"nodes: got {nodes}, wanted at least 1000")
+        origin, spacing, counts = self._nodes(nodes)
         corners = self.triangles.reshape(-1, 3)
         lower, upper = corners.min(0), corners.max(0)
-        spacing = _spacing(upper - lower, nodes)
-        counts = 2 * (np.floor((upper - lower) / spacing).astype(int) // 2 + _MARGIN) + 1
-        origin = 0.5 * (lower + upper - spacing * (counts - 1))
         values = self._samples(origin, spacing, counts)
         return DistanceGrid.from_samples(values, origin=origin, spacing=spacing, lower=lower, upper=upper)
 
@@ -162,6 +189,26 @@ class Mesh:
         near = ~even & (np.abs(values) < _BAND * spacing)
         values[near] = exact(near)
         return values
+
+    @functools.cached_property
+    def _solid(self) -> tuple[float, np.ndarray]:
+        """Volume and centre: with holes, or of parts that may overlap, by what share of each cell is inside."""
+        if self.is_closed:
+            volumes, centres = self._tetrahedra()
+            return float(volumes.sum()), volumes @ centres / volumes.sum()
+        origin, spacing, counts = self._nodes(_SOLID_NODES)
+        share = np.clip(0.5 - self._samples(origin, spacing, counts) / spacing, 0, 1)
+        total = share.sum()
+        place = [(share.sum(tuple({0, 1, 2} - {k})) * np.arange(counts[k])).sum() / total for k in range(3)]
+        return float(total * spacing**3), origin + spacing * np.array(place)
+
+    def _nodes(self, nodes: int) -> tuple[np.ndarray, float, np.ndarray]:
+        """Origin, spacing and counts of a grid around the mesh with about so many nodes."""
+        corners = self.triangles.reshape(-1, 3)
+        lower, upper = corners.min(0), corners.max(0)
+        spacing = _spacing(upper - lower, nodes)
+        counts = 2 * (np.floor((upper - lower) / spacing).astype(int) // 2 + _MARGIN) + 1
+        return 0.5 * (lower + upper - spacing * (counts - 1)), spacing, counts
 
     @functools.cached_property
     def _tree(self) -> TriangleTree:
