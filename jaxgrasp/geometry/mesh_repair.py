@@ -16,6 +16,8 @@ from jaxgrasp.geometry.triangles import signed_distances
 _SAME = 1e-9
 # A part with less than this share of the area is no surface.
 _NO_AREA = 1e-9
+# Nor does a part with less volume than this share of its area to the power 1.5 enclose anything.
+_NO_VOLUME = 1e-9
 # Corners of a part that are looked at, and the share of them that must be within others for a cavity.
 _CORNERS, _WITHIN = 64, 0.9
 
@@ -49,7 +51,8 @@ def mended(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "tr
     faces = np.where(flipped[:, None], faces[:, ::-1], faces)
     volume, area = (np.bincount(part, x) for x in _sizes(vertices[faces], part))
     real = area > _NO_AREA * area.sum()
-    volume = np.where(real, volume, 0.0)
+    # A part that is flat encloses nothing: which way round it is cannot be told.
+    volume = np.where(real & (np.abs(volume) > _NO_VOLUME * area**1.5), volume, 0.0)
     if volume.sum() < 0:
         faces, volume = faces[:, ::-1], -volume
     inward = (volume < 0) & ~_cavities(vertices, faces, part, volume)
@@ -126,8 +129,10 @@ def _cavities(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, volume:
     if not len(candidates) or not len(around):
         return found
     points = []
+    order = np.argsort(part, kind="stable")
+    starts = np.searchsorted(part[order], np.arange(len(volume) + 1))
     for number in candidates:
-        own = np.unique(faces[part == number])
+        own = np.unique(faces[order[starts[number] : starts[number + 1]]])
         points.append(vertices[own[np.linspace(0, len(own) - 1, _CORNERS).astype(int)]])
     inside = signed_distances(TriangleTree(vertices, around), np.concatenate(points)) < 0
     found[candidates] = inside.reshape(len(candidates), _CORNERS).mean(1) > _WITHIN
