@@ -169,9 +169,12 @@ class Synthesize(Reading):
             raise CommandError(f"--object: got {self.object!r}; wanted {', '.join(BUILT_IN)}, or a mesh file")
         import jax
 
+        from jaxgrasp.cli.report import counting_bar
+
         mesh = geometry.Mesh.from_file(path, self.scale)
         try:
-            grid = mesh.to_grid()
+            with counting_bar("distances to the mesh", 1) as progress:
+                grid = mesh.to_grid(progress=progress)
         except geometry.MeshError as error:
             raise geometry.MeshError(f"{path}: {error}") from None
         points = np.asarray(geometry.sample_surface(grid, jax.random.key(self.seed), 4096))

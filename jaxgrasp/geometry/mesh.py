@@ -3,7 +3,8 @@
 import functools
 import struct
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from jaxtyping import Float, Int
 
 from jaxgrasp.geometry.grid import DistanceGrid
 from jaxgrasp.geometry.mesh_files import BYTE, TRIANGLE, read_triangles
-from jaxgrasp.geometry.mesh_repair import mended
+from jaxgrasp.geometry.mesh_repair import Parts, mended
+from jaxgrasp.geometry.outer_surface import outer_surface
 from jaxgrasp.geometry.triangle_tree import TriangleTree
 from jaxgrasp.geometry.triangles import signed_distances
 from jaxgrasp.storage import FileError, allowance, open_regular, printable, reason_of
@@ -45,13 +47,16 @@ class Mesh:
     """Indices of the corners."""
     is_closed: bool = False
     """Whether it is known to be one part without holes; volume and centroid then follow from the triangles alone."""
+    parts: Parts | None = field(default=None, repr=False)
+    """Which triangles hang together; they are taken for one part where it is not known."""
 
     @classmethod
     def from_arrays(cls, vertices: np.ndarray, faces: np.ndarray) -> "Mesh":
         """A mesh of given triangles.
 
         Those that disagree with their neighbours, and parts that are inside out, are turned; triangles that are there
-        twice, and parts without area, are left out.
+        twice, and parts without area, are left out. So are strays, parts with hardly any volume beside all others, with
+        a warning. Holes get lids.
 
         Args:
             vertices: (vertices, 3), m.
@@ -71,11 +76,13 @@ class Mesh:
         if not np.isfinite(vertices).all():
             raise MeshError("got vertices that are not finite, wanted finite ones")
         try:
-            faces, is_closed = mended(vertices, faces)
+            vertices, faces, parts, is_closed, strays = mended(vertices, faces)
         except ValueError as error:
             raise MeshError(str(error)) from None
-        mesh = cls(vertices=vertices, faces=faces, is_closed=is_closed)
-        volume = float(mesh._tetrahedra()[0].sum())
+        if strays:
+            warnings.warn(f"jaxgrasp: left out {strays} stray triangles beside the object", stacklevel=2)
+        mesh = cls(vertices=vertices, faces=faces, is_closed=is_closed, parts=parts)
+        volume = float(_tetrahedra(mesh.triangles)[0].sum())
         if not abs(volume) > 1e-9 * np.ptp(mesh.triangles, axis=(0, 1)).max() ** 3:
             raise MeshError(f"got a surface around {volume:.3g} m^3, wanted one around a solid")
         return mesh
@@ -124,7 +131,7 @@ class Mesh:
 
     @property
     def volume(self) -> float:
-        """Of the solid that the signed distances describe, m^3."""
+        """Of the solid that the signed distances describe, less the cavities in it, m^3."""
         return self._solid[0]
 
     @property
@@ -137,21 +144,23 @@ class Mesh:
         return self._solid[1]
 
     def signed_distance(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
-        """Exact signed distances to all triangles, see `triangles.signed_distances`.
+        """Exact signed distances to the outer surface, see `triangles.signed_distances` and `outer_surface`.
+
+        What a finger cannot touch is no surface: walls of closed cavities, parts within others, and where they overlap.
 
         Raises:
             MeshError: too many triangles are long or overlap.
         """
-        try:
-            return signed_distances(self._tree, np.asarray(points, float))
-        except ValueError as error:
-            raise MeshError(str(error)) from None
+        return _distances(self._tree, points)
 
-    def to_grid(self, nodes: int = 200_000) -> DistanceGrid:
+    def to_grid(
+        self, nodes: int = 200_000, progress: Callable[[int, int], None] = lambda done, total: None
+    ) -> DistanceGrid:
         """The mesh as a shape: its signed distances on a grid, smoothly interpolated.
 
         Args:
             nodes: how many nodes the grid may have; what is thinner than two of its spacings is lost.
+            progress: called with how many distances are found, and how many there are to find as far as is known.
 
         Raises:
             ValueError: fewer than 1,000 nodes.
@@ -162,45 +171,27 @@ class Mesh:
         origin, spacing, counts = self._nodes(nodes)
         corners = self.triangles.reshape(-1, 3)
         lower, upper = corners.min(0), corners.max(0)
-        values = self._samples(origin, spacing, counts)
+        values = _samples(self._tree, origin, spacing, counts, progress)
         return DistanceGrid.from_samples(values, origin=origin, spacing=spacing, lower=lower, upper=upper)
 
     def deviation(self, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
         """How far points that should lie on the surface are off it, m."""
         return np.abs(self.signed_distance(points))
 
-    def _samples(self, origin: np.ndarray, spacing: float, counts: np.ndarray) -> np.ndarray:
-        """Signed distances at the nodes of a grid: exact near the surface, elsewhere between those of every other node.
-
-        The counts are odd.
-        """
-        indices = np.indices(tuple(counts))
-        even = (indices % 2 == 0).all(0)
-
-        def exact(where: np.ndarray) -> np.ndarray:
-            return self.signed_distance(origin + spacing * indices[:, where].T)
-
-        values = exact(even).reshape(counts // 2 + 1)
-        for axis in range(3):
-            ahead = np.moveaxis(values, axis, 0)
-            finer = np.empty((2 * len(ahead) - 1, *ahead.shape[1:]))
-            finer[::2], finer[1::2] = ahead, 0.5 * (ahead[:-1] + ahead[1:])
-            values = np.moveaxis(finer, 0, axis)
-        near = ~even & (np.abs(values) < _BAND * spacing)
-        values[near] = exact(near)
-        return values
-
     @functools.cached_property
     def _solid(self) -> tuple[float, np.ndarray]:
         """Volume and centre: with holes, or of parts that may overlap, by what share of each cell is inside."""
         if self.is_closed:
-            volumes, centres = self._tetrahedra()
+            volumes, centres = _tetrahedra(self.triangles)
             return float(volumes.sum()), volumes @ centres / volumes.sum()
         origin, spacing, counts = self._nodes(_SOLID_NODES)
-        share = np.clip(0.5 - self._samples(origin, spacing, counts) / spacing, 0, 1)
-        total = share.sum()
-        place = [(share.sum(tuple({0, 1, 2} - {k})) * np.arange(counts[k])).sum() / total for k in range(3)]
-        return float(total * spacing**3), origin + spacing * np.array(place)
+        share = np.clip(0.5 - _samples(self._tree, origin, spacing, counts) / spacing, 0, 1)
+        place = [(share.sum(tuple({0, 1, 2} - {k})) * np.arange(counts[k])).sum() / share.sum() for k in range(3)]
+        volume, centre = float(share.sum() * spacing**3), origin + spacing * np.array(place)
+        if self.parts is None:
+            return volume, centre
+        empty, centres = _tetrahedra(self.triangles[(self.parts.volume < 0)[self.parts.of]])
+        return volume + float(empty.sum()), (volume * centre + empty @ centres) / (volume + empty.sum())
 
     def _nodes(self, nodes: int) -> tuple[np.ndarray, float, np.ndarray]:
         """Origin, spacing and counts of a grid around the mesh with about so many nodes."""
@@ -212,14 +203,59 @@ class Mesh:
 
     @functools.cached_property
     def _tree(self) -> TriangleTree:
-        return TriangleTree(self.vertices, self.faces)
+        """Of the outer surface."""
+        if self.parts is None or self.is_closed:
+            return TriangleTree(self.vertices, self.faces)
+        try:
+            return TriangleTree(*outer_surface(self.vertices, self.faces, self.parts))
+        except ValueError as error:
+            raise MeshError(str(error)) from None
 
-    def _tetrahedra(self) -> tuple[np.ndarray, np.ndarray]:
-        """Signed volumes and centres of the tetrahedra between the triangles and a point amid them."""
-        amid = self.vertices[self.faces].mean((0, 1))
-        corners = self.triangles - amid
-        volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-        return volumes, corners.sum(1) / 4 + amid
+
+def _distances(
+    tree: TriangleTree, points: Float[np.ndarray, "points 3"], progress: Callable[[int], None] = lambda done: None
+) -> Float[np.ndarray, " points"]:
+    try:
+        return signed_distances(tree, np.asarray(points, float), progress)
+    except ValueError as error:
+        raise MeshError(str(error)) from None
+
+
+def _samples(
+    tree: TriangleTree,
+    origin: np.ndarray,
+    spacing: float,
+    counts: np.ndarray,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> np.ndarray:
+    """Signed distances at the nodes of a grid: exact near the surface, elsewhere between those of every other node.
+
+    The counts are odd.
+    """
+    indices = np.indices(tuple(counts))
+    even = (indices % 2 == 0).all(0)
+
+    def exact(where: np.ndarray, before: int = 0) -> np.ndarray:
+        points = origin + spacing * indices[:, where].T
+        return _distances(tree, points, lambda done: progress(before + done, before + len(points)))
+
+    values = exact(even).reshape(counts // 2 + 1)
+    for axis in range(3):
+        ahead = np.moveaxis(values, axis, 0)
+        finer = np.empty((2 * len(ahead) - 1, *ahead.shape[1:]))
+        finer[::2], finer[1::2] = ahead, 0.5 * (ahead[:-1] + ahead[1:])
+        values = np.moveaxis(finer, 0, axis)
+    near = ~even & (np.abs(values) < _BAND * spacing)
+    values[near] = exact(near, int(even.sum()))
+    return values
+
+
+def _tetrahedra(triangles: Float[np.ndarray, "triangles 3 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Signed volumes and centres of the tetrahedra between triangles and a point amid them."""
+    amid = triangles.mean((0, 1)) if len(triangles) else np.zeros(3)
+    corners = triangles - amid
+    volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    return volumes, corners.sum(1) / 4 + amid
 
 
 def _spacing(extents: np.ndarray, nodes: int) -> float:

@@ -46,7 +46,7 @@ class Blocks(NamedTuple):
     @classmethod
     def of(cls, points: Float[np.ndarray, "points 3"], size: int = BLOCK) -> "Blocks":
         """Puts points in blocks of so many."""
-        order = _along_curve(points)
+        order = along_curve(points)
         padded = np.pad(points[order], [(0, -len(points) % size), (0, 0)], mode="edge").reshape(-1, size, 3)
         lower, upper = padded.min(1), padded.max(1)
         return cls(padded, order, lower, upper, 0.5 * (lower + upper), 0.5 * _length(upper - lower))
@@ -85,10 +85,11 @@ class TriangleTree:
         """Sorts them."""
         used = vertices[np.unique(faces)]
         lower, upper = used.min(0), used.max(0)
-        self.centre, self.extent = 0.5 * (lower + upper), float((upper - lower).max())
+        self.centre, self.extents = 0.5 * (lower + upper), upper - lower
+        self.extent = float(self.extents.max())
         triangles = self.scaled(vertices)[faces]
         depth = max(0, int(np.ceil(np.log2(len(triangles) / LEAF))))
-        order = _along_curve(triangles.mean(1))
+        order = along_curve(triangles.mean(1))
         corners = triangles[order]
         # A corner, three times: it is no nearer than its triangle, and has no area.
         missing = (LEAF << depth) - len(corners)
@@ -188,7 +189,7 @@ def _length(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("...i,...i", vectors, vectors))
 
 
-def _along_curve(points: np.ndarray) -> np.ndarray:
+def along_curve(points: np.ndarray) -> np.ndarray:
     """The order of points along Morton's curve, which leaves a cell of space only when it has been everywhere in it."""
     lower = points.min(0)
     extent = max(float(np.ptp(points, axis=0).max()), 1e-30)

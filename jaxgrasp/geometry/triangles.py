@@ -27,6 +27,8 @@ _ARCTAN = (
     0.9999999818,
 )
 
+# Points at a time, so that progress is seen.
+_POINTS = 50_000
 # Bytes of what may be read for each pair of a point and a leaf that are looked at: 27 million of them, which take less
 # than ten seconds. A surface of a million even triangles makes 18 million.
 _OF_PAIR = 80
@@ -34,7 +36,9 @@ _OF_PAIR = 80
 Vector = Sequence[Array] | Array
 
 
-def signed_distances(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) -> np.ndarray:
+def signed_distances(
+    tree: TriangleTree, points: Float[np.ndarray, "points 3"], progress: Callable[[int], None] = lambda done: None
+) -> np.ndarray:
     """Signed distances of points to a surface of triangles, negative inside.
 
     Inside is where the generalised winding number, the solid angle under which the surface is seen over 4 pi, is above
@@ -43,6 +47,7 @@ def signed_distances(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) 
     Args:
         tree: the triangles, corners in counterclockwise order seen from outside.
         points: (points, 3), m.
+        progress: called with how many distances are found.
 
     Returns:
         (points,), m, float64.
@@ -50,17 +55,21 @@ def signed_distances(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) 
     Raises:
         ValueError: too many triangles are long or overlap, so that distances would take long.
     """
-    scaled = tree.scaled(points)
-    squared, work = _squares(tree, scaled)
-    angles = _windings(tree, scaled, work)
-    return np.where(angles > math.pi, -1.0, 1.0) * np.sqrt(squared) * tree.extent
+    scaled, found, work = tree.scaled(points), np.empty(len(points)), 0
+    for begin in range(0, len(points), _POINTS):
+        own = slice(begin, begin + _POINTS)
+        squared, work = _squares(tree, scaled[own], work)
+        angles, work = _windings(tree, scaled[own], work)
+        found[own] = np.where(angles > math.pi, -1.0, 1.0) * np.sqrt(squared) * tree.extent
+        progress(min(begin + _POINTS, len(points)))
+    return found
 
 
-def _squares(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, int]:
-    """Squared distances, and how many pairs of points and leaves were looked at."""
+def _squares(tree: TriangleTree, points: Float[np.ndarray, "points 3"], work: int) -> tuple[np.ndarray, int]:
+    """Squared distances, and the pairs of points and leaves that were looked at so far, `work` of them before."""
     blocks = tree.blocks_for_nearest(points)
     size = blocks.points.shape[1]
-    squared, work = np.full(blocks.points.shape[:2], np.inf, np.float32), 0
+    squared = np.full(blocks.points.shape[:2], np.inf, np.float32)
     for near in tree.nearest(blocks):
         # Of a block's leaves, few have to do with each of its points.
         least, most = _in_chunks(_squares_to_boxes, tree.boxes, blocks.points, near).swapaxes(0, 1)
@@ -73,8 +82,8 @@ def _squares(tree: TriangleTree, points: Float[np.ndarray, "points 3"]) -> tuple
     return blocks.in_order(squared), work
 
 
-def _windings(tree: TriangleTree, points: Float[np.ndarray, "points 3"], work: int) -> np.ndarray:
-    """Half the solid angles under which the surface is seen; `work` pairs of points and leaves came before."""
+def _windings(tree: TriangleTree, points: Float[np.ndarray, "points 3"], work: int) -> tuple[np.ndarray, int]:
+    """Half the solid angles under which the surface is seen, and the pairs that were looked at so far."""
     blocks = Blocks.of(points)
     angles = np.zeros(blocks.points.shape[:2])
     for near, far, level in tree.around(blocks):
@@ -82,7 +91,7 @@ def _windings(tree: TriangleTree, points: Float[np.ndarray, "points 3"], work: i
         _reduce(np.add, angles, near, _in_chunks(_half_angles, tree.leaves, blocks.points, near))
         dipoles = np.concatenate([level.middle, level.area], -1)
         _reduce(np.add, angles, far, _in_chunks(_half_angles_of_dipoles, dipoles, blocks.points, far))
-    return blocks.in_order(angles)
+    return blocks.in_order(angles), work
 
 
 def _spent(before: int, more: int) -> int:

@@ -43,19 +43,26 @@ def test_flipped_faces_are_turned(name, share):
 
 
 @pytest.mark.parametrize("name", WHOLE)
-def test_holes(name):
+def test_holes_get_lids(name):
     whole = WHOLE[name]
     kept = np.random.default_rng(0).permutation(len(whole.faces))[: int(0.95 * len(whole.faces))]
     check(read(trimesh.Trimesh(whole.vertices, whole.faces[kept], process=False)), whole.volume, whole.center_mass)
 
 
-def test_a_cube_without_its_top():
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_cube_without_its_top_and_one_without_its_bottom(sign):
     cube = trimesh.creation.box(extents=(0.1, 0.1, 0.1))
-    kept = cube.faces[cube.face_normals[:, 2] < 0.5]
+    kept = cube.faces[sign * cube.face_normals[:, 2] < 0.5]
     found = read(trimesh.Trimesh(cube.vertices, kept, process=False))
-    assert not found.is_closed
-    # The signed distances bulge in at the top; the signed tetrahedra were 8.75 mm off.
-    np.testing.assert_allclose(found.centroid - PLACE, 0, atol=3e-3)
+    assert found.is_closed
+    assert found.volume == pytest.approx(1e-3, rel=1e-9)
+    np.testing.assert_allclose(found.centroid, PLACE, atol=1e-12)
+
+
+def test_a_hole_as_large_as_what_is_there_gets_no_lid():
+    cap = BALL.faces[BALL.triangles_center[:, 2] > 0.04]
+    found = read(trimesh.Trimesh(BALL.vertices, cap, process=False))
+    assert not found.is_closed and len(found.faces) == len(cap)
 
 
 @pytest.mark.parametrize("name", WHOLE)
@@ -109,6 +116,18 @@ def test_a_triangle_without_area_far_away_is_left_out():
     found = g.Mesh.from_arrays(vertices, faces)
     assert len(found.faces) == len(BALL.faces) and found.is_closed
     assert float(found.to_grid(nodes=10_000).spacing) < 0.01
+
+
+@pytest.mark.parametrize("away", [0.3, 10.0])
+def test_strays_are_left_out_with_a_word(away):
+    stray = np.array(
+        [[[away, 0, 0], [away, 0, 0.01], [away, 0.01, 0]], [[0, away, 0], [0, away, 0.02], [0.01, away, 0]]]
+    )
+    vertices = np.concatenate([BALL.vertices, stray.reshape(-1, 3)])
+    faces = np.concatenate([BALL.faces, len(BALL.vertices) + np.arange(6).reshape(2, 3)])
+    with pytest.warns(UserWarning, match="left out 2 stray triangles"):
+        found = g.Mesh.from_arrays(vertices, faces)
+    assert found.is_closed and len(found.faces) == len(BALL.faces)
 
 
 def test_a_surface_with_one_side_is_refused():
