@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _ROWS = 20
 _TEXT_COLUMNS = 2
 _PLAIN_WIDTH = 160
+# What bars say until the first batch is done.
+_COMPILING = "compiling, which is kept for the next run"
 
 
 class Clock:
@@ -71,7 +73,7 @@ def progress_bar(total: int, clock: Clock) -> Iterator[Callable[[int], None]]:
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("compiling", total=total)
+        task = progress.add_task(_COMPILING, total=total)
 
         def show(done: int) -> None:
             signals.checkpoint()
@@ -133,7 +135,7 @@ def ascent_bar(steps: int) -> "Iterator[Callable[[int, Record], None]]":
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("compiling", total=steps)
+        task = progress.add_task(_COMPILING, total=steps)
 
         def show(done: int, record: "Record") -> None:
             signals.checkpoint()
@@ -157,7 +159,7 @@ def hand_bar(starts: int, steps: int) -> Iterator[Callable[[int, int, dict[str, 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("compiling", total=steps)
+        task = progress.add_task(_COMPILING, total=steps)
 
         def show(done: int, total: int, record: dict[str, np.ndarray]) -> None:
             signals.checkpoint()
@@ -311,7 +313,9 @@ def _table(ranking: Ranking, count: int, rows: int, unit: str) -> Table:
     texts = texts[:_TEXT_COLUMNS]
     others = [name for name in ranking.metrics if name != "margin"]
     numbers = (f"margin [{unit}]", "upper bound", "largest normal force [N]", "effort [N²]", *others)
-    for name in ("rank", "grasp", *texts, *others, *numbers[:2], "status", *numbers[2:4]):
+    # Named as in the table that is written.
+    given = [f"input_{name}" if name == "status" else name for name in texts]
+    for name in ("rank", "grasp", *given, *others, *numbers[:2], "status", *numbers[2:4]):
         justify, overflow = "right" if name == "rank" or name in numbers else "left", "fold" if name in others else None
         table.add_column(escape(name), justify=justify, overflow=overflow or "ellipsis")
     for place, row in enumerate(ranking.order[:rows]):

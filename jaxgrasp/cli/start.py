@@ -1,5 +1,6 @@
 """Starts a command, and answers with an exit code; what takes long to import is imported once signals are handled."""
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -27,6 +28,8 @@ def run(arguments: Sequence[str] | None) -> int:
 
 def run_process() -> None:
     """Runs a command as a process of its own."""
+    # XLA's alarms about slow compiling, for developers, would tear the progress bar.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     with signals.handled():
         try:
             code = run(None)
