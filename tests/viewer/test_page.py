@@ -16,9 +16,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 import jaxgrasp as jg
+import jaxgrasp.hands as hands
 from jaxgrasp.candidates import sample_grasps
 
 pytest.importorskip("viser")
@@ -31,7 +33,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 # ms: programs are compiled when the first grasp is shown.
-PATIENCE = 300_000
+PATIENCE = 120_000
 # s, of a page with 10,000 grasps; the best of so many loads, since other programs run as well.
 LOADED, LOADS = 3.0, 5
 # Half a unit of the last of five digits that the page has.
@@ -80,6 +82,31 @@ def address(tmp_path_factory) -> Iterator[str]:
     ended(server)
 
 
+@pytest.fixture(scope="module")
+def address_with_a_hand(tmp_path_factory) -> Iterator[str]:
+    """A page of two grasps of a can by four fingers, which touch it."""
+    folder = tmp_path_factory.mktemp("hand")
+    (folder / "pieces").mkdir()
+    trimesh.creation.cylinder(radius=0.025, height=0.05, sections=24).export(folder / "pieces" / "0.obj")
+    hand = str(Path(hands.__file__).parent / "four_fingers.xml")
+    names = hands.Scene.build(hand=hand, object=str(folder / "pieces")).joint_names
+    # Tips of 8 mm at the end of fingers of 105 mm, whose roots are 60 mm from the axis; a little inside.
+    joints = np.zeros((2, len(names)))
+    joints[:, [name.endswith("flex1") for name in names]] = np.arcsin((0.06 - 0.033) / 0.105) + [[0.001], [0.002]]
+    base, placed = np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, 1)), np.tile([0.0, 0, 0.1, 1, 0, 0, 0], (2, 1))
+    np.savez(
+        folder / "grasps.npz",
+        grasp_qpos=np.concatenate([base, joints], -1),
+        obj_pose=placed,
+        obj_scale=np.ones(2),
+        joint_names=np.array(names),
+    )
+    options = ["--hand", hand, "--object", "pieces", "--grasps", "grasps.npz", "--friction", "0.8"]
+    server, address = started(folder, *options)
+    yield address
+    ended(server)
+
+
 class Watched:
     """A page, with what it asked for and complained of."""
 
@@ -108,6 +135,11 @@ class Watched:
     def margin(self) -> float:
         text = self.page.get_by_text(re.compile(r"^margin [\d.e+-]+ N$")).first.inner_text(timeout=PATIENCE)
         return float(text.split()[1])
+
+    def picture(self, path: Path) -> np.ndarray:
+        """What is drawn, left of the panel."""
+        self.page.locator("canvas").first.screenshot(path=path)
+        return np.asarray(Image.open(path).convert("RGB")).astype(int)[:, :600]
 
     def settled(self, margin: float) -> None:
         """Waits until the page shows a margin."""
@@ -239,18 +271,13 @@ def test_it_draws(watched, tmp_path):
     watched.page.get_by_text("slips").first.wait_for(timeout=PATIENCE)
     time.sleep(2)
 
-    def picture(name: str) -> np.ndarray:
-        canvas = watched.page.locator("canvas").first
-        canvas.screenshot(path=tmp_path / name)
-        return np.asarray(Image.open(tmp_path / name).convert("RGB")).astype(int)[:, :600]
-
-    still = picture("still.png")
+    still = watched.picture(tmp_path / "still.png")
     red, green, blue = np.moveaxis(still, -1, 0)
     greenish = (green > red + 60) & (green > blue + 10)
     assert greenish.sum() > 100 and (still.max(-1) < 60).sum() > 100
     watched.page.get_by_role("button", name="play the worst disturbance").click()
     time.sleep(1)
-    assert (np.abs(picture("played.png") - still).max(-1) > 60).sum() > 100
+    assert (np.abs(watched.picture(tmp_path / "played.png") - still).max(-1) > 60).sum() > 100
 
 
 def test_a_page_that_is_loaded_again_begins_anew(watched):
@@ -271,6 +298,51 @@ def test_two_browsers_have_pages_of_their_own(browser, address, watched):
     assert other.other_grasp(row) != row == watched.grasp()
     other.close()
     watched.settled(margin_of(row, friction))
+
+
+def test_another_grasp_stands_beside_it(watched, tmp_path):
+    watched.page.get_by_text("slips").first.wait_for(timeout=PATIENCE)
+    shown = watched.page.get_by_text(re.compile(r"^margin [\d.e+-]+ N$"))
+    assert shown.count() == 1
+    watched.page.get_by_text("Beside it").click()
+    # Folders take a while to open.
+    time.sleep(2)
+    watched.input("another grasp").click(force=True)
+    shown.nth(1).wait_for(timeout=PATIENCE)
+    first, second = (float(text.split()[1]) for text in shown.all_inner_texts())
+    rows = [
+        int(text.split(":")[1])
+        for text in watched.page.get_by_text(re.compile(r"^superquadric:\d+$")).all_inner_texts()
+    ]
+    for row, margin in zip((rows[-2], rows[-1]), (first, second), strict=True):
+        assert abs(margin_of(row) - margin) <= SHOWN * margin
+    time.sleep(2)
+    both = watched.picture(tmp_path / "both.png")
+    watched.input("another grasp").click(force=True)
+    shown.nth(1).wait_for(state="detached", timeout=PATIENCE)
+    time.sleep(2)
+    assert (np.abs(watched.picture(tmp_path / "one.png") - both).max(-1) > 60).sum() > 1000
+
+
+def test_a_trial_is_played_back(browser, address_with_a_hand, tmp_path):
+    watched = Watched(browser, address_with_a_hand)
+    watched.margin()
+    watched.page.get_by_text("Trial in MuJoCo").click()
+    watched.page.get_by_role("button", name="try this grasp").click()
+    watched.page.get_by_text(re.compile(r"^grasps\.npz:\d: \w+")).wait_for(timeout=PATIENCE)
+    play = watched.page.get_by_role("button", name="play", exact=True)
+    # It is enabled once the film is there, which is then shown once.
+    sync_api.expect(play).to_be_enabled(timeout=PATIENCE)
+    begin = watched.drag("time [s]", 0.0)
+    time.sleep(2)
+    first = watched.picture(tmp_path / "first.png")
+    end = watched.drag("time [s]", 1.0)
+    assert end > begin
+    time.sleep(2)
+    assert (np.abs(watched.picture(tmp_path / "last.png") - first).max(-1) > 60).sum() > 100
+    watched.page.get_by_role("button", name="back to the grasp").click()
+    sync_api.expect(play).to_be_disabled(timeout=PATIENCE)
+    watched.close()
 
 
 def test_the_address_is_this_machines(tmp_path):
