@@ -86,7 +86,7 @@ def main() -> None:
             extent = np.ptp(mesh.vertices, axis=0).max()
             off = volume / mesh.volume - 1, np.linalg.norm(centre - mesh.center_mass) / extent
             close += max(abs(off[0]), off[1]) <= CLOSE
-            cells.append(f"{100 * off[0]:.2f}, {100 * off[1]:.2f}")
+            cells.append(f"{100 * off[0]:z.2f}, {100 * off[1]:z.2f}")
         rows.append(f"| {name} | {len(mesh.faces):,} | " + " | ".join(cells) + " |")
         print(rows[-1])
     count = len(WAYS) * len(meshes)
