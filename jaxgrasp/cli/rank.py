@@ -1,6 +1,5 @@
 """`jaxgrasp rank`: files of candidates in, a table and a figure out."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from jaxgrasp.disturbance import DisturbanceSet
     from jaxgrasp.hands import HandObject
     from jaxgrasp.ranking import Ranking
-
-SAMPLED = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +68,7 @@ class Rank(RankOptions):
                     return rank_in_parts(self, folder, given, unit, clock)
                 candidates = given.candidates()
             else:
-                candidates = self._sampled()
+                candidates = self.sampled()
         except CandidateError as error:
             raise CommandError(str(error)) from error
         if not self.of_hand.given:
@@ -87,12 +84,8 @@ class Rank(RankOptions):
     def _check(self) -> None:
         from jaxgrasp.ranking import TABLE_ENDINGS
 
+        self.check_candidates()
         check_options(
-            ("--friction", self.friction, self.friction is None or 0.0 <= self.friction < math.inf, "a number >= 0"),
-            ("--max-force", self.max_force, self.max_force is None or 0.0 < self.max_force < math.inf, "newtons > 0"),
-            ("--gravity", self.gravity, math.isfinite(self.gravity), "a finite number of m/s^2"),
-            ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
-            ("--share", self.share, 0.0 < self.share <= 1.0, "a number in (0, 1]"),
             ("--top", self.top, self.top >= 0, "a number >= 0"),
             ("--explain", self.explain, self.explain >= 0, "a number >= 0"),
         )
@@ -119,15 +112,6 @@ class Rank(RankOptions):
         ):
             if path is not None:
                 check_output(path, option, endings, inputs)
-
-    def _sampled(self) -> "Candidates":
-        from jaxgrasp.candidates import sample_grasps
-
-        return sample_grasps(
-            SAMPLED,
-            friction=0.6 if self.friction is None else self.friction,
-            max_force=10.0 if self.max_force is None else self.max_force,
-        )
 
     def _rank(
         self,

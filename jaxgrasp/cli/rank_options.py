@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 import tyro
 
+from jaxgrasp.cli.candidate_options import CandidateOptions
 from jaxgrasp.cli.checks import check_options
 from jaxgrasp.cli.clusters import check_ray
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.scene import Scene
-from jaxgrasp.cli.setting import Reading
 
 OUTPUT, FIGURE = Path("ranking.parquet"), Path("ranking.png")
 """What is written where nothing else is said."""
@@ -76,32 +76,12 @@ class InParts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RankOptions(Reading):
+class RankOptions(CandidateOptions):
     """What is ranked, and how."""
 
     files: tyro.conf.Positional[tuple[str, ...]] = ()
     """Files of candidates, .npz, Parquet or Arrow, folders and patterns of these, or URLs such as s3://bucket/folder;
     none for the built-in object."""
-
-    friction: float | None = None
-    """Coulomb's friction coefficient for files without any."""
-
-    max_force: float | None = None
-    """Largest normal force for files without any, N."""
-
-    gravity: float = 0.0
-    """Gravity along the object's -z, m/s^2, under which the mass of each candidate must be borne; 0 for none."""
-
-    disturbances: str = "forces"
-    """forces: 1 N along the six axes; ball: 1 N in any direction; box: 1 N along each axis together with 0.02 N m about
-    each; or a FILE of wrenches, .npy or .npz with the field wrenches (n_d, 6), N and N m. The margin is the factor by
-    which they may grow."""
-
-    cone_edges: int = 8
-    """Edges of the friction pyramid."""
-
-    share: float = 0.75
-    """The part of its margin for which the tightening forces of a grasp are found."""
 
     top: int = 10
     """How many of the best get tightening forces."""

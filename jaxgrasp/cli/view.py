@@ -1,7 +1,6 @@
 """`jaxgrasp view`: grasps in a browser, or written for other programs."""
 
 import importlib.util
-import math
 import socket
 import time
 from collections.abc import Callable
@@ -13,11 +12,11 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli import signals
+from jaxgrasp.cli.candidate_options import CandidateOptions
 from jaxgrasp.cli.checks import Skipped, check_options, check_output, warn_of_conventions
 from jaxgrasp.cli.errors import CommandError
-from jaxgrasp.cli.rank import SAMPLED
 from jaxgrasp.cli.scene import Scene
-from jaxgrasp.cli.setting import Reading, configure_jax, named_disturbances
+from jaxgrasp.cli.setting import configure_jax, named_disturbances
 from jaxgrasp.cli.streams import printing, tell_notices
 from jaxgrasp.cli.view_exports import export
 from jaxgrasp.cli.view_trials import films, protocols
@@ -33,7 +32,7 @@ _PATIENCE = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Reading):
+class View(CandidateOptions):
     """Look at grasps in a browser, each in 3D with sliders that change it.
 
     Takes files of candidates, the table of `jaxgrasp rank`, or a hand with an object and grasps as `rank` does; without
@@ -44,24 +43,6 @@ class View(Reading):
     files: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Files of candidates, .npz; or one table of `jaxgrasp rank`, .parquet, .csv or .npz, whose files of candidates are
     where they were. With --scene, a table with its configurations."""
-
-    friction: float | None = None
-    """Coulomb's friction coefficient for files without any."""
-
-    max_force: float | None = None
-    """Largest normal force for files without any, N."""
-
-    gravity: float = 0.0
-    """Gravity along the object's -z, m/s^2, under which the mass of each candidate must be borne; 0 for none."""
-
-    disturbances: str = "forces"
-    """As for rank: forces, ball, box or a FILE of wrenches."""
-
-    cone_edges: int = 8
-    """Edges of the friction pyramid."""
-
-    share: float = 0.75
-    """The part of the margin for which tightening forces are first shown."""
 
     host: str = "127.0.0.1"
     """The address to listen at. Others than the default may let other machines in; nobody is asked for a password."""
@@ -104,12 +85,8 @@ class View(Reading):
         return skipped.exit_code()
 
     def _check(self) -> None:
+        self.check_candidates()
         check_options(
-            ("--friction", self.friction, self.friction is None or 0.0 <= self.friction < math.inf, "a number >= 0"),
-            ("--max-force", self.max_force, self.max_force is None or 0.0 < self.max_force < math.inf, "newtons > 0"),
-            ("--gravity", self.gravity, math.isfinite(self.gravity), "a finite number of m/s^2"),
-            ("--cone-edges", self.cone_edges, self.cone_edges >= 3, "at least 3"),
-            ("--share", self.share, 0.0 < self.share <= 1.0, "a number in (0, 1]"),
             ("--top", self.top, self.top >= 1, "at least 1"),
             ("--port", self.port, 0 <= self.port < 65536, "0 to 65535"),
         )
@@ -158,7 +135,7 @@ class View(Reading):
             table = read_table(self.files[0])
             candidates = self._of_table(table, self.files[0])
         else:
-            candidates = self._of_files() if self.files else self._sampled(SAMPLED)
+            candidates = self._of_files() if self.files else self.sampled()
         warn_of_conventions(candidates)
         if table is None:
             candidates, table = self._ranked(candidates, disturbances)
@@ -183,12 +160,6 @@ class View(Reading):
             self.files, friction=self.friction, max_force=self.max_force, with_mass=bool(self.gravity)
         )
 
-    def _sampled(self, count: int) -> "Candidates":
-        from jaxgrasp.candidates import sample_grasps
-
-        friction = 0.6 if self.friction is None else self.friction
-        return sample_grasps(count, friction=friction, max_force=10.0 if self.max_force is None else self.max_force)
-
     def _of_table(self, table: dict[str, np.ndarray], path: Path) -> "Candidates":
         """The candidates of a ranking's table, in its order."""
         from jaxgrasp.candidates import concatenate, read_candidates
@@ -203,7 +174,7 @@ class View(Reading):
                 given = {"friction": self.friction, "max_force": self.max_force}
                 part = read_candidates([file], **given, with_mass=bool(self.gravity))
             elif name == "superquadric":
-                part = self._sampled(int(index.max()) + 1)
+                part = self.sampled(int(index.max()) + 1)
             else:
                 raise CommandError(
                     f"{path}: source: got {name}, which is not there; wanted the files that were ranked, or the hand "
