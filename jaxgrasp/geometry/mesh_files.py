@@ -9,6 +9,7 @@ import re
 import struct
 import warnings
 from array import array
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ _Polygons = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 # Bytes of memory that a byte of a file, and a triangle, may take until distances are known.
 BYTE, TRIANGLE = 40, 2048
-_LINE, _HEADER = 4096, 1 << 16
+_LINE, _HEADER, _PIECE = 4096, 1 << 16, 1 << 20
 _CORNER = re.compile(rb"^\s*vertex[ \t]+(\S+[ \t]+\S+[ \t]+\S+)", re.MULTILINE | re.IGNORECASE)
 # In lines of OBJ: one that goes on in the next, up to three words of a vertex, and all of a face.
 _CONTINUED = re.compile(rb"\\[ \t\r\f\v]*(?:\n|\Z)")
@@ -112,15 +113,29 @@ def _stl(content: bytes) -> _Polygons:
     return ordered[first], indices, np.full(len(corners) // 3, 3)
 
 
+def _pieces(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """Pieces of whole lines and where they begin: of all lines at a time, as many words would be in memory."""
+    begin = 0
+    while begin < len(content):
+        end = content.find(b"\n", begin + _PIECE) + 1 or len(content)
+        yield begin, content[begin:end]
+        begin = end
+
+
 def _obj(content: bytes) -> _Polygons:
-    content = _CONTINUED.sub(b" ", content) + b"\n"
+    content = b"".join(_CONTINUED.sub(b" ", piece) for _, piece in _pieces(content)) + b"\n"
     _check_lines(content)
-    rows = _VERTEX.findall(content)
-    points = _numbers(b" ".join(rows))
-    if len(points) != 3 * len(rows):
+    points, rows, faces = [], 0, []
+    for _, piece in _pieces(content):
+        found = _VERTEX.findall(piece)
+        points.append(b" ".join(found))
+        rows += len(found)
+        # Of normals and textures nothing is kept.
+        faces.append(re.sub(rb"/\S*", b"", b"".join(_FACE.findall(piece))))
+    points = _numbers(b" ".join(points))
+    if len(points) != 3 * rows:
         raise ValueError("a vertex of fewer than three numbers")
-    # Of normals and textures nothing is kept.
-    faces = re.sub(rb"/\S*", b"", b"".join(_FACE.findall(content)))
+    faces = b"".join(faces)
     corners = _numbers(faces, int)
     text = np.frombuffer(b" " + faces, np.uint8)
     blank = text <= ord(" ")
@@ -128,10 +143,18 @@ def _obj(content: bytes) -> _Polygons:
     counts = np.diff(np.searchsorted(words, ends), prepend=0)
     if (corners < 0).any():
         # Counted backwards from the last vertex before the face.
-        of_points, of_faces = ([found.start() for found in kind.finditer(content)] for kind in (_VERTEX, _FACE))
+        of_points, of_faces = (_starts(kind, content) for kind in (_VERTEX, _FACE))
         before = np.repeat(np.searchsorted(of_points, of_faces), counts)
         corners = np.where(corners < 0, before + 1 + corners, corners)
     return points.reshape(-1, 3), corners - 1, counts
+
+
+def _starts(kind: re.Pattern, content: bytes) -> np.ndarray:
+    """Where matches begin."""
+    starts = [
+        np.array([begin + found.start() for found in kind.finditer(piece)], int) for begin, piece in _pieces(content)
+    ]
+    return np.concatenate(starts)
 
 
 class _Property(NamedTuple):
