@@ -166,12 +166,13 @@ def _lids(
     # Edges of a lid run the other way.
     end, begin = faces.T.reshape(-1), np.roll(faces, -1, 1).T.reshape(-1)
     ends = np.stack([np.roll(welded, -1, 1).T.reshape(-1), welded.T.reshape(-1)], -1)
-    _, line, count = np.unique(np.sort(ends, -1), axis=0, return_inverse=True, return_counts=True)
-    lone = (count[line.reshape(-1)] == 1) & (area[part] > 0)[np.tile(np.arange(len(faces)), 3)]
+    # One number stands for an edge, which way it runs or not.
+    edges = ends.min(-1) * (int(welded.max()) + 1) + ends.max(-1)
+    _, line, count = np.unique(edges, return_inverse=True, return_counts=True)
+    lone = (count[line] == 1) & (area[part] > 0)[np.tile(np.arange(len(faces)), 3)]
     begin, end, own, rim = begin[lone], end[lone], np.tile(part, 3)[lone], _rims(ends[lone])
     begin, end, own, rim = (x[rim >= 0] for x in (begin, end, own, rim))
-    edges = np.bincount(rim)
-    centre = np.stack([np.bincount(rim, x) for x in vertices[begin].T], -1) / edges[:, None]
+    centre = np.stack([np.bincount(rim, x) for x in vertices[begin].T], -1) / np.bincount(rim)[:, None]
     arms = vertices[begin] - centre[rim], vertices[end] - centre[rim]
     of_lid = np.bincount(rim, 0.5 * np.linalg.norm(np.cross(*arms), axis=-1))
     first = np.unique(rim, return_index=True)[1]
