@@ -85,6 +85,23 @@ def check_output_folder(folder: Path) -> None:
         raise CommandError(f"--output {folder}: cannot be written ({reason_of(error)})") from error
 
 
+def check_new_folder(folder: Path) -> None:
+    """Finds out whether a folder is new or empty, and can be written.
+
+    Args:
+        folder: That of `--output`.
+
+    Raises:
+        CommandError: It is not, or cannot.
+    """
+    try:
+        if folder.is_dir() and any(folder.iterdir()):
+            raise CommandError(f"--output {folder}: got a folder with files in it; wanted a new or empty one")
+    except OSError as error:
+        raise CommandError(f"--output {folder}: cannot be written ({reason_of(error)})") from error
+    check_output_folder(folder)
+
+
 def warn_of_conventions(candidates: "Candidates") -> None:
     """Notes, in one line, units and directions of contacts that can hardly be meant.
 

@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 
 from jaxgrasp.cli import signals
-from jaxgrasp.cli.checks import Skipped, check_options, check_output, check_output_folder
+from jaxgrasp.cli.checks import Skipped, check_new_folder, check_options, check_output
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.setting import Reading
 from jaxgrasp.cli.streams import notice, printing
@@ -119,15 +119,7 @@ class Convert(Reading):
         if self.output.suffix in endings:
             check_output(self.output, "--output", endings, self.grasps)
         elif plain in _FOLDERS:
-            self._check_folder()
+            check_new_folder(self.output)
         else:
             got = f"the ending {self.output.suffix!r}"
             raise CommandError(f"--output {self.output}: got {got}; wanted {' or '.join(endings)}")
-
-    def _check_folder(self) -> None:
-        try:
-            if self.output.is_dir() and any(self.output.iterdir()):
-                raise CommandError(f"--output {self.output}: got a folder with files in it; wanted a new or empty one")
-        except OSError as error:
-            raise CommandError(f"--output {self.output}: cannot be written ({reason_of(error)})") from error
-        check_output_folder(self.output)

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any
 from jaxgrasp.cli.checks import check_options
 from jaxgrasp.cli.errors import CommandError
 from jaxgrasp.cli.streams import notice
+from jaxgrasp.storage import printable
 
 if TYPE_CHECKING:
     from jaxgrasp import hands
     from jaxgrasp.hands import HandObject
 
 BUILT_IN = ("shadow_hand", "four_fingers")
+# A mesh that fills less of its convex hull is not nearly convex.
+_CONVEX = 0.95
 # Options that a scene of a file answers itself.
 _OF_BUILT = ("mass", "density", "torsional_friction", "condim", "gravity_vector", "table")
 
@@ -143,6 +146,7 @@ class HandScene:
         files = [name for name in self.environment if Path(name).suffix]
         if len(files) > 1:
             raise CommandError(f"--environment: got {len(files)} files; wanted one")
+        _tell_of_hollows(Path(object))
         try:
             return Built.build(
                 hand=_read_hand(self.hand),
@@ -206,3 +210,23 @@ class HandScene:
         except (ValueError, OSError) as error:
             raise CommandError(f"--scene {self.scene}: {' '.join(str(error).split())}") from error
         return self.hand_of(given, friction, max_force)
+
+
+def _tell_of_hollows(object: Path) -> None:
+    """Notes where a mesh is not convex, since its hull is what touches."""
+    from jaxgrasp.geometry import Mesh, MeshError, convexity
+
+    if object.suffix.lower() not in (".obj", ".stl") or not object.is_file():
+        return
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            mesh = Mesh.from_file(object)
+        filled = convexity(mesh) if mesh.is_closed else 1.0
+    except MeshError:
+        # MuJoCo reads it by itself, and says what it lacks.
+        return
+    if filled < _CONVEX:
+        notice(
+            f"{printable(str(object))}: its convex hull is what touches, and it fills {filled:.0%} of that; "
+            "`jaxgrasp pieces` takes it apart"
+        )

@@ -7,13 +7,16 @@ import tyro
 from jaxgrasp.cli.compare import Compare
 from jaxgrasp.cli.convert import Convert
 from jaxgrasp.cli.evaluate import Evaluate
+from jaxgrasp.cli.pieces import Pieces
 from jaxgrasp.cli.rank import Rank
 from jaxgrasp.cli.squeeze import Squeeze
 from jaxgrasp.cli.synthesize import Synthesize
 from jaxgrasp.cli.view import View
 
 
-def parsed(arguments: Sequence[str] | None) -> Compare | Convert | Evaluate | Rank | Squeeze | Synthesize | View:
+def parsed(
+    arguments: Sequence[str] | None,
+) -> Compare | Convert | Evaluate | Pieces | Rank | Squeeze | Synthesize | View:
     """Parses a command line.
 
     Args:
@@ -31,6 +34,7 @@ def parsed(arguments: Sequence[str] | None) -> Compare | Convert | Evaluate | Ra
             "squeeze": Squeeze,
             "evaluate": Evaluate,
             "view": View,
+            "pieces": Pieces,
         },
         prog="jaxgrasp",
         description="Robustness of multi-fingered grasps, in batch.",

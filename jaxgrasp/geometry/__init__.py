@@ -1,6 +1,7 @@
 """Shapes by their signed distances: primitives, unions, triangle meshes, and what lies on their surfaces."""
 
 from jaxgrasp.geometry.combined import Placed, SmoothUnion
+from jaxgrasp.geometry.convex_pieces import convex_pieces, convexity
 from jaxgrasp.geometry.grid import DistanceGrid
 from jaxgrasp.geometry.mesh import Mesh, MeshError
 from jaxgrasp.geometry.primitives import Box, Capsule, Cylinder, Ellipsoid, Sphere, Superquadric
@@ -21,6 +22,8 @@ __all__ = [
     "Sphere",
     "Superquadric",
     "centroid",
+    "convex_pieces",
+    "convexity",
     "normals",
     "project",
     "sample_surface",
