@@ -1,4 +1,4 @@
-"""Triangles as people have them: which way round they are, which ones are there twice, and which are none.
+"""Mends triangle meshes: turns faces, drops doubles and strays, and puts lids on holes.
 
 Triangles with a common edge agree where they run along it in opposite ways. Parts that hang together so are turned as a
 whole, so that they are counterclockwise seen from outside; a part that is inside out within others is a cavity.
