@@ -52,12 +52,12 @@ class CandidateOptions(Reading):
             ("--share", self.share, 0.0 < self.share <= 1.0, "a number in (0, 1]"),
         )
 
-    def sampled(self, count: int = SAMPLED) -> "Candidates":
-        """Grasps on a built-in object."""
+    def sampled(self, count: int | None = None) -> "Candidates":
+        """Grasps on a built-in object, as many as the package samples without a file where no count is given."""
         from jaxgrasp.candidates import sample_grasps
 
         return sample_grasps(
-            count,
+            SAMPLED if count is None else count,
             friction=0.6 if self.friction is None else self.friction,
             max_force=10.0 if self.max_force is None else self.max_force,
         )

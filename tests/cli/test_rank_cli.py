@@ -13,8 +13,7 @@ import pyarrow.parquet
 import pytest
 
 from jaxgrasp.candidates import sample_grasps
-from jaxgrasp.cli import main, setting
-from jaxgrasp.cli import rank as rank_command
+from jaxgrasp.cli import candidate_options, main, setting
 from jaxgrasp.solvers.status import Status
 
 YCB = Path(__file__).resolve().parents[3] / "shared" / "data" / "ycb_allegro_grasps.npz"
@@ -66,7 +65,7 @@ def test_prints_and_writes(here, capsys):
 
 
 def test_without_a_file_it_samples(here, capsys, monkeypatch):
-    monkeypatch.setattr(rank_command, "SAMPLED", 24)
+    monkeypatch.setattr(candidate_options, "SAMPLED", 24)
     assert main(["rank", "--output", "table.csv", "--figure", "None"]) == 0
     assert "superquadric" in capsys.readouterr().out
     assert [file.name for file in here.iterdir()] == ["table.csv"]
