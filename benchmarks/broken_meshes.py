@@ -93,7 +93,7 @@ def main() -> None:
     lines = [
         "# Broken meshes",
         "",
-        f"Made by `python -m benchmarks.broken_meshes`: {len(meshes)} meshes broken in {len(WAYS)} ways. "
+        f"Made by `python -m benchmarks.broken_meshes FILES FOLDERS`: {len(meshes)} meshes broken in {len(WAYS)} ways. "
         f"{FLIPPED:.0%} of the faces flipped; {CUT_OUT:.0%} of them cut out; {TWICE:.0%} there twice, half of these "
         f"the other way round; a smaller copy nested inside; {STRAYS} stray triangles 10 to 100 extents away.",
         "",

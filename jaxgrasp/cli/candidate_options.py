@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from jaxgrasp.candidates import Candidates
 
 SAMPLED = 10_000
-"""How many grasps are sampled where no file is given."""
+"""Number of grasps that are sampled where no file is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CandidateOptions(Reading):
-    """What candidates lack, and what their margins are of."""
+    """Options that complete candidates, and name the disturbances of their margins."""
 
     friction: float | None = None
     """Coulomb's friction coefficient for files without any."""

@@ -212,19 +212,25 @@ class HandScene:
         return self.hand_of(given, friction, max_force)
 
 
-def _tell_of_hollows(object: Path) -> None:
-    """Notes where a mesh is not convex, since its hull is what touches."""
+@functools.cache
+def _convexity(path: Path) -> float:
+    """The share of its hull that the mesh of a file fills, found once for the scenes of all scales; 1 if not known."""
     from jaxgrasp.geometry import Mesh, MeshError, convexity
 
-    if object.suffix.lower() not in (".obj", ".stl") or not object.is_file():
-        return
     try:
         with warnings.catch_warnings(action="ignore"):
-            mesh = Mesh.from_file(object)
-        filled = convexity(mesh) if mesh.is_closed else 1.0
+            mesh = Mesh.from_file(path)
+        return convexity(mesh) if mesh.is_closed else 1.0
     except MeshError:
         # MuJoCo reads it by itself, and says what it lacks.
+        return 1.0
+
+
+def _tell_of_hollows(object: Path) -> None:
+    """Notes where a mesh is not convex, since its hull is what touches."""
+    if object.suffix.lower() not in (".obj", ".stl") or not object.is_file():
         return
+    filled = _convexity(object)
     if filled < _CONVEX:
         notice(
             f"{printable(str(object))}: its convex hull is what touches, and it fills {filled:.0%} of that; "

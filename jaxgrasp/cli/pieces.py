@@ -33,10 +33,10 @@ class Pieces(Reading):
     """The new or empty folder to write, an .obj for each piece."""
 
     threshold: float = 0.05
-    """How concave a piece may be, of the mesh's size: 0.01 (many pieces) to 1."""
+    """Largest concavity of a piece, as CoACD measures it: 0.01 (many pieces) to 1."""
 
     most: int | None = None
-    """How many pieces there may be; None for as many as it takes."""
+    """Largest number of pieces; None for as many as it takes."""
 
     def run(self) -> int:
         """Reads, writes and prints.

@@ -48,7 +48,7 @@ class Mesh:
     is_closed: bool = False
     """Whether it is known to be one part without holes; volume and centroid then follow from the triangles alone."""
     parts: Parts | None = field(default=None, repr=False)
-    """Which triangles hang together; they are taken for one part where it is not known."""
+    """The parts of triangles that hang together; None takes all of them for one part."""
 
     @classmethod
     def from_arrays(cls, vertices: np.ndarray, faces: np.ndarray) -> "Mesh":
@@ -131,7 +131,7 @@ class Mesh:
 
     @property
     def volume(self) -> float:
-        """Of the solid that the signed distances describe, less the cavities in it, m^3."""
+        """Volume of the solid that the signed distances describe, less the cavities in it, m^3."""
         return self._solid[0]
 
     @property
@@ -203,7 +203,7 @@ class Mesh:
 
     @functools.cached_property
     def _tree(self) -> TriangleTree:
-        """Of the outer surface."""
+        """The triangles of the outer surface."""
         if self.parts is None or self.is_closed:
             return TriangleTree(self.vertices, self.faces)
         try:

@@ -29,7 +29,7 @@ _CORNERS, _WITHIN = 64, 0.9
 
 
 class Parts(NamedTuple):
-    """Which triangles hang together."""
+    """Parts of a mesh: triangles that hang together."""
 
     of: Int[np.ndarray, " triangles"]
     """The part of each triangle."""
@@ -48,7 +48,7 @@ class Mended(NamedTuple):
     is_closed: bool
     """Whether it is one part, every edge of which has two triangles."""
     strays: int
-    """How many triangles were left out because they are nothing beside all others."""
+    """Number of triangles that were left out as strays."""
 
 
 def mended(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "triangles 3"]) -> Mended:
@@ -208,7 +208,7 @@ def _rims(ends: np.ndarray) -> np.ndarray:
 
 
 def _strays(triangles: np.ndarray, part: np.ndarray, volume: np.ndarray) -> np.ndarray:
-    """Which parts are nothing, or almost nothing, beside all others."""
+    """Finds strays: parts with hardly any volume, beside all others."""
     small = volume < _OF_VOLUME * volume.sum()
     if not small.any() or small.all():
         return np.zeros(len(volume), bool)

@@ -1,4 +1,4 @@
-"""Which part of a surface a finger can touch: not what lies inside the solid, as nested and overlapping parts have it.
+"""Finds the outer surface of a mesh, which a finger can touch, without what its parts hide inside each other.
 
 A triangle is hidden where it is inside another part. What is farther from that part's surface than it is large is
 hidden wholly or not at all, many neighbours at a time; other triangles are cut until their pieces are small.
@@ -44,7 +44,7 @@ class _Balls(NamedTuple):
 class _Verdict(NamedTuple):
     hidden: Bool[np.ndarray, " balls"]
     doubtful: Bool[np.ndarray, " balls"]
-    """Whether it may be hidden in part."""
+    """True where a part of it may be hidden."""
 
 
 class _Hiding(NamedTuple):
@@ -56,7 +56,7 @@ class _Hiding(NamedTuple):
     """Radius of a ball that is hidden if its middle is, m."""
 
     def verdict(self, balls: _Balls) -> _Verdict:
-        """Which pieces other parts hide."""
+        """Finds the pieces that other parts hide."""
         hidden, doubtful = np.zeros((2, len(balls.part)), bool)
         for number, tree in zip(self.parts, self.trees, strict=True):
             beyond = np.abs(balls.middle - tree.centre) - balls.radius[:, None]
@@ -102,7 +102,7 @@ def outer_surface(
 def _of_triangles(
     corners: Float[np.ndarray, "triangles 3 3"], part: Int[np.ndarray, " triangles"], hiding: _Hiding, outside: float
 ) -> tuple[Bool[np.ndarray, " triangles"], Int[np.ndarray, " doubtful"]]:
-    """Which triangles are hidden, and which ones may be in part."""
+    """Finds triangles that are hidden wholly, and those of which a part may be."""
     order = along_curve(corners.mean(1))
     order = order[np.argsort(part[order], kind="stable")]
     sorted_part = part[order]
@@ -124,7 +124,7 @@ def _of_triangles(
 def _cut(
     corners: Float[np.ndarray, "triangles 3 3"], part: Int[np.ndarray, " triangles"], hiding: _Hiding, outside: float
 ) -> tuple[Bool[np.ndarray, " triangles"], Bool[np.ndarray, " triangles"], Float[np.ndarray, "pieces 3 3"]]:
-    """Which triangles are wholly visible after all, which are wholly hidden, and the visible pieces of the others."""
+    """Cuts triangles: True for those that are wholly visible, for those wholly hidden, and visible pieces of others."""
     corners, part = _quartered(corners), np.tile(part, 4)
     hidden, doubtful = hiding.verdict(_balls(corners, part, outside))
     visible, pieces = ~hidden & ~doubtful, corners[:0]

@@ -33,7 +33,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 # ms: programs are compiled when the first grasp is shown.
-PATIENCE = 120_000
+PATIENCE = 300_000
 # s, of a page with 10,000 grasps; the best of so many loads, since other programs run as well.
 LOADED, LOADS = 3.0, 5
 # Half a unit of the last of five digits that the page has.
